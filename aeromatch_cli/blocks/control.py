@@ -173,7 +173,13 @@ def _in_world_heights(
     survey: Survey, path: Path, crs: str, origin_m: FloatArray, places_m: FloatArray, heights: str
 ) -> tuple[FloatArray, list[str]]:
     """Positions (N, 3) in the world with its heights, where both sides state theirs, and a remark."""
-    own = heights_of(survey.crs) if survey.crs and crs != LOCAL else ""
+    own = (heights_of(survey.crs) if survey.crs else "") or survey.heights if crs != LOCAL else ""
+    if survey.heights and not heights:
+        words = heights_words(survey.heights)
+        return places_m, [
+            f"{path.name}: {words} of control points: nothing states what those of the images count from: they must "
+            "count from the same zero; --set block.heights=... names theirs"
+        ]
     if not (own and heights) or own == heights:
         return places_m, []
     heights_m, why_not = converted_heights(crs, own, heights, places_m + origin_m)

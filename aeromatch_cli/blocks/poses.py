@@ -16,11 +16,13 @@ Columns, in any order and case (aliases in brackets):
   frame                         of orientation.csv: images in a frame of their own have no pose here (optional)
 
 Lengths are metres and angles degrees unless the name of the column says otherwise (`alt_ft`, `x [us-ft]`, `omega_gon`,
-`yaw (rad)`, `accuracy_mm`), or a comment above the header (`# angles in gon`, `# heights: feet`); a cell may have its
-own unit (`142.6 m`), and latitudes and longitudes may be degrees, minutes and seconds.
+`yaw (rad)`, `accuracy_mm`), a column of its own (`altitude_unit`), or a comment (`# angles in gon`, `# heights: feet`,
+see `statements`); a cell may have its own unit (`142.6 m`), and latitudes and longitudes may be degrees, minutes and
+seconds, with their side of the globe in a column (`latref`).
 
 Beside x y or lat lon, a height under another name (altitude, ellipsoidal height, height, elevation) is taken and said;
-heights above ground (relative_altitude, agl) are refused.
+heights above ground (relative_altitude, agl) are refused. Columns e and n stand for x and y where no other position is
+there.
 
 The separator is a comma, semicolon, tab or blanks, found from the header; lines that start with # are comments (a
 header behind # is accepted); a decimal comma is accepted where the separator is another, or in quotes. A line whose
@@ -34,27 +36,27 @@ import csv
 import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m, overall_sigma_m
-from aeromatch_cli.blocks.crs import ELLIPSOID
-from aeromatch_cli.blocks.fields import with_name, words_of
-from aeromatch_cli.blocks.gis_columns import with_coordinates
-from aeromatch_cli.blocks.units import (
-    Kind,
-    degrees_of,
-    factor,
-    heights_named,
-    is_relative,
-    kind_of,
-    metres_of,
-    named_column,
-    refuse_rounded,
-    stated_units,
+from aeromatch_cli.blocks.column_names import (
+    LATITUDE_SIDES,
+    LONGITUDE_SIDES,
+    comments_of_columns,
+    is_height,
+    on_side,
+    seems_height,
+    side,
+    words_of_height,
 )
+from aeromatch_cli.blocks.fields import IMAGE, with_name, words_of
+from aeromatch_cli.blocks.gis_columns import with_coordinates
+from aeromatch_cli.blocks.statements import Quantity, Statements, statements_of
+from aeromatch_cli.blocks.units import Kind, degrees_of, factor, metres_of, named_column, refuse_rounded
+from aeromatch_cli.blocks.zeros import is_relative, zero_of
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
@@ -74,6 +76,9 @@ _AXIS_SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_xy_m")
 _OWN_FRAME = "own"
 _ANGLE_SIGMAS = ("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
 _ALL_SIGMAS = (*_SIGMAS, *_AXIS_SIGMAS, *_ANGLE_SIGMAS)
+# The side of the globe of latitudes and of longitudes.
+_SIDES = {"lat": ("lat_side", "NS"), "lon": ("lon_side", "EW")}
+_SIDE_COLUMNS = tuple(column for column, _ in _SIDES.values())
 _KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", "frame", *_ALL_SIGMAS)
 _LONGEST_NAME = 100  # characters of a column
 
@@ -105,7 +110,11 @@ _ALIASES = {
     **{"sigma_angle": "sigma_angle_deg"} | {f"sigma_{name}": f"sigma_{name}_deg" for name in ("omega", "phi", "kappa")},
     **{name: f"{name}_deg" for name in ("omega", "phi", "kappa", "yaw", "pitch", "roll")},
     "heading": "yaw_deg",
+    **dict.fromkeys(LATITUDE_SIDES, "lat_side") | dict.fromkeys(LONGITUDE_SIDES, "lon_side"),
 }
+# Names that count where there is no other image, and no other position.
+_OTHER_IMAGES = ("photoid", "photo_id", "picture_name", "bild", "foto")
+_OTHER_PLACES = {"e": "x", "east": "x", "n": "y", "north": "y"}
 # Columns that are taken for z or alt where there is none, the likeliest first.
 _OTHER_HEIGHTS = ("z", "alt", "absolute_altitude", "absalt", "abs_alt", "ellipsoidal_height", "ellipsoid_height",
                   "orthometric_height", "altitude_above_sealevel", "altitude_msl", "height", "elevation",
@@ -118,14 +127,9 @@ _RELATIVE_HEIGHTS = ("relative_altitude", "rltalt", "relalt", "agl", "height_agl
                      "altitude_above_takeoff")  # fmt: skip
 # What names the CRS of every line.
 _CRS_COLUMNS = ("crs", "srs", "epsg", "cs_name", "coordinate_system")
-_CRS_COMMENT = re.compile(
-    r"#[\s,]*(?:(?:crs|srs|projection|coordinate\s*(?:reference\s*)?system)\s*[:=,]\s*(?P<named>\S.*)"
-    r"|(?P<code>EPSG\s*:\s*\d+(?:\+\d+)?)\s*)",
-    re.IGNORECASE,
-)
 # Every name of a column, in lower case, and the one that it has here.
 _NAMES: Mapping[str, str] = {
-    **{name: name for name in (*_KNOWN, *_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS, *_CRS_COLUMNS)},
+    **{name: name for name in (*_KNOWN, *_SIDE_COLUMNS, *_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS, *_CRS_COLUMNS)},
     **_ALIASES,
 }
 _HEIGHTS = (*_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS)
@@ -138,7 +142,10 @@ _RANGES = {"lat": 180.0, "lon": 180.0, "qw": 1.05, "qx": 1.05, "qy": 1.05, "qz":
 _LARGEST_ANGLE_DEG = 360.0
 # What a spreadsheet writes to say what separates.
 _SEPARATOR_LINE = re.compile(r"\"?sep=.\"?", re.IGNORECASE)
+_HEAD_LINES = 100  # of which one must be the header
 _LINES_NAMED = 5  # of those with the same fault
+_SIDE = re.compile(r"[nsew]|north|south|east|west")
+_NORTH = re.compile(r"\b(true|grid|magnetic)(?:[ _-]*north)?\b")
 # Images by line, by what is wrong with it.
 _Faults = dict[str, dict[int, str]]
 
@@ -204,6 +211,10 @@ class _Layout:
     height: str = ""  # the column that is taken for z or alt under another name
     crs_column: int = -1
     not_taken: str = ""  # columns of a second form of position
+    zero: str = ""  # what heights count from by their column, as of `crs.heights_of`
+    sides: Mapping[str, str] = field(default_factory=dict)  # of latitudes and longitudes, by their columns
+    true_north: bool = False
+    remarks: tuple[str, ...] = ()
 
 
 def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str | None = None) -> PoseList:
@@ -216,7 +227,7 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
     lines = [line for line in enumerate(with_coordinates(text.splitlines()), start=1) if line[1].strip()]
     if lines and _SEPARATOR_LINE.fullmatch(lines[0][1].strip()):
         lines = lines[1:]
-    header, layout, records = _header(path, lines)
+    header, layout, records, said = _header(path, lines)
     across_m, up_m = usual_m
     usual = {"x": across_m, "y": across_m, "z": up_m, "alt": up_m}
     layout = replace(layout, factors={**usual, **layout.factors})
@@ -240,10 +251,10 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
         raise ConfigError(f"{path}: no line follows the header in line {header}: add one line per image")
     rows, exchanged = _with_latitudes(path, rows)
     ignored = [f"{path.name}: unknown columns ignored: {', '.join(layout.ignored)}"] if layout.ignored else []
-    datum = stated_units(line for _, line in lines).get("datum")
-    if datum:
+    ignored += [f"{path.name}: {words}" for words in (*layout.remarks, *said.remarks)]
+    if said.datum:
         ignored.append(
-            f"{path.name}: {datum!r}: ground and control points must count from the same zero, or state their own "
+            f"{path.name}: {said.datum!r}: ground and control points must count from the same zero, or state their own "
             "(EPSG:32633+5773)"
         )
     if layout.not_taken:
@@ -258,16 +269,11 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
         raise ConfigError(
             f"{path}, line {max(systems.values())}: the list names {len(systems)} coordinate systems: one is needed"
         )
-    crs = next(iter(systems), None) or stated_crs(text for _, text in lines)
+    crs = next(iter(systems), None) or said.crs_of(grid=layout.position_kind == "grid")
+    if crs is None:
+        ignored += [f"{path.name}: {words}" for words in said.not_whole]
     remarks = (*ignored, *exchanged, *warnings)
-    heights = ELLIPSOID if layout.height.startswith(ELLIPSOID) else heights_named(datum or "")
-    return PoseList(tuple(rows), layout.position_kind, remarks, crs=crs, heights=heights)
-
-
-def stated_crs(lines: Iterable[str]) -> str | None:
-    """What a comment says of the CRS, None where none does."""
-    found = (_CRS_COMMENT.fullmatch(line.strip()) for line in lines)
-    return next(((match["named"] or match["code"]).strip(" \t,;") for match in found if match), None)
+    return PoseList(tuple(rows), layout.position_kind, remarks, crs=crs, heights=layout.zero or said.zero)
 
 
 def is_position(name: str, *, height: bool) -> bool:
@@ -290,7 +296,9 @@ def has_header(lines: Sequence[str]) -> bool:
 
 def is_track(lines: Sequence[str]) -> bool:
     """Whether the first line names latitudes and longitudes, and no image."""
-    _, columns, _ = _columns(next((line.strip().lstrip("#").strip() for line in lines if line.strip()), ""))
+    head, *rest = [line.strip().lstrip("#").strip() for line in lines[:_HEAD_LINES] if line.strip()] or [""]
+    separator, columns, _ = _columns(head)
+    columns, _ = _with_images(columns, _cells(rest[0], separator) if rest else [])
     return {"lat", "lon"} <= set(columns) and "image" not in columns
 
 
@@ -343,8 +351,8 @@ def _text(path: Path) -> str:
     return text
 
 
-def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, list[tuple[int, str]]]:
-    """Line number of the header, what it says, and the lines behind it without comments."""
+def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, list[tuple[int, str]], Statements]:
+    """Line number of the header, what it says, the lines behind it without comments, and what comments state."""
     if not lines:
         raise ConfigError(f"pose list {path} is empty: its first line names the columns, such as image,x,y,z")
     first = next((place for place, (_, line) in enumerate(lines) if not line.lstrip().startswith("#")), len(lines))
@@ -353,17 +361,47 @@ def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, lis
     for place in [*places, *range(first - 1, -1, -1)]:
         number, line = lines[place]
         separator, columns, units = _columns(line.lstrip().lstrip("#").strip() if place < first else line.strip())
+        records = [(n, text) for n, text in lines[place + 1 :] if not text.lstrip().startswith("#")]
+        columns, taken = _with_images(columns, _cells(records[0][1], separator) if records else [])
         if "image" in columns and len(columns) > 1:
-            records = [(n, text) for n, text in lines[place + 1 :] if not text.lstrip().startswith("#")]
-            said = stated_units(text for _, text in lines)
-            crs_named = stated_crs(text for _, text in lines) is not None
-            return number, _layout(path, number, separator, columns, units, said, crs_named=crs_named), records
+            where = f"{path}, line {number}"
+            cells = (dict(enumerate(_cells(text, separator))) for _, text in records)
+            more, unit_columns, unknown = comments_of_columns(where, columns, cells)
+            said = statements_of([*more, *(text for n, text in lines if n != number)])
+            columns = tuple("" if k in unit_columns else name for k, name in enumerate(columns))
+            layout = _layout(path, number, separator, columns, units, said)
+            return number, replace(layout, remarks=(*taken, *unknown, *layout.remarks)), records, said
     number, line = lines[min(first, len(lines) - 1)]
     found = ", ".join(_columns(line.strip())[1])[:120]
     raise ConfigError(
         f"{path}, line {number}: no header with a column 'image' (found {found}): the first line must name the "
         "columns, such as image,x,y,z,omega_deg,phi_deg,kappa_deg"
     )
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    """Values of a line, which may be cut in other places than by `_split`."""
+    if separator is None:
+        return words_of(line)
+    try:
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:
+        return line.split(separator)
+
+
+def _with_images(columns: tuple[str, ...], first: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
+    """Columns with one of images, and a remark where its name is none that is known; as they are where there is one,
+    and in lines that name no position. first: values of the line below."""
+    names = {_OTHER_PLACES.get(name, name) for name in columns}
+    if "image" in columns or not ({"x", "y"} <= names or {"lat", "lon"} <= names):
+        return columns, []
+    place = next((columns.index(name) for name in _OTHER_IMAGES if name in columns), -1)
+    if place < 0:
+        place = next((k for k, cell in enumerate(first[: len(columns)]) if IMAGE.fullmatch(cell.strip())), -1)
+    if place < 0:
+        return columns, []
+    changed = tuple("image" if k == place else name for k, name in enumerate(columns))
+    return changed, [f"column {columns[place]!r} is taken for the names of the images"]
 
 
 def _columns(line: str) -> tuple[str | None, tuple[str, ...], tuple[str, ...]]:
@@ -382,6 +420,9 @@ def _canonical(cell: str) -> tuple[str, str]:
     if len(cell) > _LONGEST_NAME:
         return cell[:_LONGEST_NAME], ""  # no name, and the pattern would take hours for a hundred thousand brackets
     name, unit = named_column(cell, _NAMES)
+    if name not in _NAMES.values() and words_of_height(cell)[0]:
+        name, unit = words_of_height(cell)
+        name = _NAMES.get(name, name)
     return (_RELATIVE_HEIGHTS[0], "") if name in _OTHER_HEIGHTS and is_relative(unit) else (name, unit)
 
 
@@ -389,10 +430,10 @@ def _kind(column: str) -> Kind | None:
     """Whether a column holds lengths or angles, None for neither."""
     if column in ("lat", "lon") or column.endswith("_deg"):
         return "angle"
-    return "length" if column in ("x", "y", *_HEIGHTS) or column in _ALL_SIGMAS else None
+    return "length" if column in ("x", "y", *_HEIGHTS, *_ALL_SIGMAS) or is_height(column) else None
 
 
-def _factors(where: str, columns: Sequence[str], units: Sequence[str], said: Mapping[str, str]) -> dict[str, float]:
+def _factors(where: str, columns: Sequence[str], units: Sequence[str], said: Statements) -> dict[str, float]:
     """Metres or degrees of one unit of every column: by its name, else by what a comment says. Raises ConfigError."""
     found: dict[str, float] = {}
     for column, unit in zip(columns, units, strict=True):
@@ -400,23 +441,34 @@ def _factors(where: str, columns: Sequence[str], units: Sequence[str], said: Map
         if kind is None:
             continue
         if column in _ALL_SIGMAS:
-            subjects: tuple[str, ...] = ("accuracies",)
-        elif column in _HEIGHTS:
-            subjects = ("heights", "coordinates", "units")
+            quantities: tuple[Quantity, ...] = ("accuracies",)
+        elif column in ("x", "y", "lat", "lon"):
+            quantities = ("across", "coordinates", "all")
         else:
-            subjects = ("coordinates", "units") if column in ("x", "y", "lat", "lon") else ("angles", "units")
-        stated = (said[subject] for subject in subjects if subject in said)
-        # Coordinates in degrees say nothing of heights, and one unit of all that is given nothing of the other kind.
-        others = (text for text in stated if kind_of(text) == kind or subjects[0] in said)
-        text = unit or next(others, "")
+            quantities = ("angles", "all") if kind == "angle" else ("heights", "coordinates", "all")
+        text = unit or said.unit(kind, *quantities)
         if text:
             found[column] = factor(where, column, text, kind)
     return found
 
 
+def _with_sides(columns: Sequence[str], units: Sequence[str]) -> tuple[tuple[str, ...], dict[str, str], str]:
+    """Units without what is none: sides of the globe (`latitude (S)`), by their columns, and the north that headings
+    count from (`yaw (true north)`), "" for none."""
+    plain, sides, north = [], {}, ""
+    for column, unit in zip(columns, units, strict=True):
+        text = unit
+        if column in _SIDES and unit[:1].upper() in tuple(_SIDES[column][1]) and _SIDE.fullmatch(unit):
+            sides[column], text = unit[:1].upper(), ""
+        elif column == "yaw_deg" and (match := _NORTH.search(unit)):
+            north, text = match[1], _NORTH.sub("", unit).strip(" ,;/")
+        plain.append(text)
+    return tuple(plain), sides, north
+
+
 def _layout(
     path: Path, number: int, separator: str | None, columns: tuple[str, ...], units: tuple[str, ...],
-    said: Mapping[str, str], *, crs_named: bool,
+    said: Statements,
 ) -> _Layout:  # fmt: skip
     where = f"{path}, line {number}"
     first = columns.index("image")
@@ -424,37 +476,62 @@ def _layout(
     twice = sorted({name for name in columns if name and columns.count(name) > 1})
     if twice:
         raise ConfigError(f"{where}: column {twice[0]!r} is named twice: keep one")
+    renamed = tuple(_OTHER_PLACES.get(name, name) for name in columns)
+    if {"x", "y"} <= set(renamed) and not {"x", "y", "lat", "lon"} & set(columns):
+        columns = renamed
+    stated_in = dict(zip(columns, units, strict=True))
+    units, sides, north = _with_sides(columns, units)
     factors = _factors(where, columns, units, said)
     crs_column = next((place for place, name in enumerate(columns) if name in _CRS_COLUMNS), -1)
-    columns, not_taken = _one_position(columns, crs_named=crs_named or crs_column >= 0)
+    columns, not_taken = _one_position(columns, crs_named=said.crs is not None or crs_column >= 0)
     columns, height = _with_height(columns)
     if height in factors:
         factors |= {own: factors[height] for own in ("z", "alt") if own in columns}
-    unknown = tuple(name for name in columns if name and name not in _KNOWN and name not in _CRS_COLUMNS)
+    known = (*_KNOWN, *_SIDE_COLUMNS, *_CRS_COLUMNS)
+    unknown = tuple(name for name in columns if name and name not in known)
     for name in unknown:
-        near = difflib.get_close_matches(name, [known for known in _KNOWN if known not in columns], n=1, cutoff=0.75)
-        if near and len(name) > 2 and name not in _HEIGHTS:
+        near = difflib.get_close_matches(name, [one for one in _KNOWN if one not in columns], n=1, cutoff=0.75)
+        if near and len(name) > 2 and name not in _HEIGHTS and not is_height(name):
             raise ConfigError(f"{where}: unknown column {name!r}: did you mean {near[0]!r}?")
     position = _form(where, "position", _POSITIONS, columns, unknown)
     if position is None:
         raise ConfigError(f"{where}: no position: add the columns x,y,z or lat,lon,alt")
-    if "relative" in said and _POSITIONS[cast(PositionKind, position)][2] in columns:
+    own = _POSITIONS[cast(PositionKind, position)][2]
+    if said.relative and own in columns:
         raise ConfigError(
-            f"{path}: {said['relative']!r} says that heights do not count from a datum: leave the column out, or give "
+            f"{path}: {said.relative!r} says that heights do not count from a datum: leave the column out, or give "
             "heights above the ellipsoid or sea level"
         )
     attitude = _form(where, "attitude", _ATTITUDES, columns, unknown)
+    north = _checked_north(where, north, said, position, attitude)
+    taken = height or own
+    zero = zero_of(re.split(r"[\s_,;/.-]+", f"{taken} {stated_in.get(taken, '')}"))
+    heights = [name for name in unknown if own not in columns and seems_height(name) and name not in _RELATIVE_HEIGHTS]
+    remarks = [f"{', '.join(heights)} may be heights and are not read: name the column of heights {own}"]
     return _Layout(
-        separator,
-        columns,
-        cast(PositionKind, position),
-        cast(AttitudeKind, attitude or "none"),
-        unknown,
-        factors,
-        height,
-        crs_column,
-        not_taken,
-    )
+        separator, columns, cast(PositionKind, position), cast(AttitudeKind, attitude or "none"), unknown, factors,
+        height, crs_column, not_taken, zero, sides, north == "true" and position == "grid",
+        tuple(remarks if heights else ()),
+    )  # fmt: skip
+
+
+def _checked_north(where: str, north: str, said: Statements, position: str, attitude: str | None) -> str:
+    """The north that headings count from, by their column, else by a comment; "" for the usual one. Raises ConfigError
+    for one that cannot be applied."""
+    if attitude is None or (attitude != "yaw_pitch_roll" and said.north != "magnetic"):
+        return ""
+    found, words = (north, f"column yaw names {north} north") if north else (said.north, f"{said.north_in!r}")
+    if found == "magnetic":
+        raise ConfigError(
+            f"{where}: {words}: headings from magnetic north lack the declination: add it, and give them from true "
+            "north"
+        )
+    if found == "grid" and position == "geographic":
+        raise ConfigError(
+            f"{where}: {words}: beside lat and lon headings count from true north: give x and y in the CRS of the "
+            "grid, or headings from true north"
+        )
+    return found
 
 
 def _one_position(columns: tuple[str, ...], *, crs_named: bool) -> tuple[tuple[str, ...], str]:
@@ -476,6 +553,8 @@ def _with_height(columns: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
         if set(across) <= set(columns) and own not in columns:
             relative = bool(set(columns) & set(_RELATIVE_HEIGHTS))
             other = next((name for name in (_FROM_DATUM if relative else _OTHER_HEIGHTS) if name in columns), "")
+            more = [name for name in columns if is_height(name) and name not in _HEIGHTS]
+            other = other or (more[0] if len(more) == 1 else "")
             if other:
                 return tuple(own if name == other else name for name in columns), other
     return columns, ""
@@ -538,6 +617,8 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         sigmas[1] = max(turns)
     across = _POSITIONS[layout.position_kind][:2]
     x, y = numbers(across)
+    if layout.position_kind == "geographic":
+        x, y = (_on_side(path, number, name, record, layout, one) for name, one in zip(across, (x, y), strict=True))
     height = _POSITIONS[layout.position_kind][2]
     z = numbers((height,))[0] if height in record else None
     attitude = numbers(_ATTITUDES[layout.attitude_kind]) if layout.attitude_kind != "none" else ()
@@ -569,8 +650,20 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         camera=record.get("camera", ""),
         sigmas_m=completed_sigmas_m(x_m, y_m, z_m, across_m=across_m, overall_m=sigmas[0]),
         sigma_angle_deg=sigmas[1],
+        true_north=layout.true_north,
         numbered=image.isdigit(),
     )
+
+
+def _on_side(
+    path: Path, line: int, name: str, record: Mapping[str, str], layout: _Layout, degrees: float | None
+) -> float | None:
+    """Degrees with the sign of the side of the globe that another column, or the name of this one, states."""
+    column, sides = _SIDES[name]
+    if degrees is None:
+        return None
+    found = side(f"{path}, line {line}, side of {name}", record.get(column, ""), sides) or layout.sides.get(name, "")
+    return on_side(f"{path}, line {line}, column {name}", degrees, found)
 
 
 def _number(path: Path, line: int, column: str, cell: str, unit: float) -> float | None:

@@ -7,21 +7,28 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Literal
 
+from aeromatch_cli.blocks.zeros import bare, is_datum
 from aeromatch_cli.errors import ConfigError
 
 Kind = Literal["length", "angle"]
 
 US_FOOT_M = 1200.0 / 3937.0
+_FEET = ("ft", "feet", "foot")
+_SURVEY = ("us", "ussurvey", "survey", "usa", "american")
 _METRES: Mapping[str, float] = {
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres", "mtr"), 1.0),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres", "mtr", "metern"), 1.0),
     **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1000.0),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 0.01),
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 0.001),
-    **dict.fromkeys(("ft", "feet", "foot", "ift", "intft", "internationalfeet", "internationalfoot"), 0.3048),
-    **dict.fromkeys(("usft", "ftus", "sft", "usfeet", "usfoot", "ussurveyfeet", "ussurveyfoot"), US_FOOT_M),
+    **dict.fromkeys(("yd", "yard", "yards"), 0.9144),
+    **{f"{which}{foot}": 0.3048 for which in ("", "i", "int", "intl", "international") for foot in _FEET},
+    **{f"{foot}{which}": 0.3048 for which in ("int", "intl", "international") for foot in _FEET},
+    **dict.fromkeys(("pies", "pieds", "piedi", "fuss", "fuß"), 0.3048),
+    **{f"{which}{foot}": US_FOOT_M for which in (*_SURVEY, "s") for foot in _FEET},
+    **{f"{foot}{which}": US_FOOT_M for which in _SURVEY for foot in _FEET},
 }  # fmt: skip
 _DEGREES: Mapping[str, float] = {
     **dict.fromkeys(("deg", "degs", "degree", "degrees", "decimaldegrees", "decimaldegree", "dd", "°"), 1.0),
@@ -29,6 +36,8 @@ _DEGREES: Mapping[str, float] = {
     **dict.fromkeys(("rad", "radian", "radians"), math.degrees(1.0)),
     **dict.fromkeys(("mrad", "milliradian", "milliradians"), math.degrees(1e-3)),
     **dict.fromkeys(("gon", "gons", "grad", "grads", "gradian", "gradians"), 0.9),
+    **dict.fromkeys(("centesimaldegree", "centesimaldegrees", "g", "400g", "gon400", "grad400"), 0.9),
+    **dict.fromkeys(("mgon", "milligon"), 0.9e-3) | dict.fromkeys(("cc", "centesimalseconds"), 0.9e-4),
     **dict.fromkeys(("arcmin", "arcminutes"), 1.0 / 60.0),
     **dict.fromkeys(("arcsec", "arcseconds"), 1.0 / 3600.0),
 }
@@ -39,31 +48,7 @@ _SILENT = frozenset(
      "longitude", "latitude", "altitude", "height", "true", "grid", "gimbal", "camera", "absolute", "abs", "1sigma",
      "sigma", "rms", "rmse", "std")
 )  # fmt: skip
-# Zeros of heights.
-_DATUMS = re.compile(
-    r"(above)?(wgs84)?(the)?(msl|amsl|asl|sealevel|meansealevel|hae|ellipsoid(al)?(height)?|orthometric(height)?"
-    r"|geoid(al)?(height)?|egm(96|08|2008|84)|navd88|ngvd29|evrf\d*|dhhn\d*|odn)(height|datum)?"
-)
-# Of these the zeros that are known exactly: vertical CRSs, and the ellipsoid.
-_ZEROS: Mapping[str, str] = {
-    **dict.fromkeys(("hae", "ellipsoid", "ellipsoidal"), "ellipsoid"),
-    **{"egm84": "EPSG:5798", "egm96": "EPSG:5773", "egm08": "EPSG:3855", "egm2008": "EPSG:3855"},
-    **{"navd88": "EPSG:5703", "ngvd29": "EPSG:7968", "evrf2000": "EPSG:5730", "evrf2007": "EPSG:5621"},
-    **{"evrf2019": "EPSG:9389", "dhhn92": "EPSG:5783", "dhhn2016": "EPSG:7837", "odn": "EPSG:5701"},
-}
-_RELATIVE = re.compile(r"(above|over)?(the)?(agl|ground|groundlevel|relative|rel|ato|takeoff|takeoffpoint|home)")
 _BRACKET = re.compile(r"(.*\S)[\s_]*[\[(]([^\[\]()]*)[\])]\s*")
-_SUBJECTS: Mapping[str, tuple[str, ...]] = {
-    "heights": ("height", "heights", "altitude", "altitudes", "elevation", "elevations", "z"),
-    "angles": ("angle", "angles", "rotations", "attitude", "attitudes", "orientation", "orientations", "opk", "ypr",
-               "omega phi kappa", "yaw pitch roll", "phi omega kappa"),
-    "coordinates": ("coordinates", "positions", "position", "x y", "x y z", "easting northing", "lengths", "distances"),
-    "accuracies": ("accuracy", "accuracies", "standard deviations", "sigmas"),
-    "units": ("unit", "units"),
-}  # fmt: skip
-_LINKS = frozenset(
-    ("are", "is", "in", "given", "stated", "measured", "unit", "units", "all", "the", "as", "of", "m", "above")
-)
 
 
 def named_column(cell: str, names: Mapping[str, str]) -> tuple[str, str]:
@@ -78,7 +63,7 @@ def named_column(cell: str, names: Mapping[str, str]) -> tuple[str, str]:
     name = re.sub(r"[\s-]+", "_", name.strip()).strip("_")
     if name not in names:
         for cut in (name.rpartition("_"), _last_two(name)):
-            if cut[0] in names and any(_bare(cut[2]) in units for units in _UNITS.values()) and not unit:
+            if cut[0] in names and any(bare(cut[2]) in units for units in _UNITS.values()) and not unit:
                 return names[cut[0]], cut[2]
     return names.get(name, name), unit
 
@@ -89,19 +74,14 @@ def _last_two(name: str) -> tuple[str, str, str]:
     return (parts[0], "_", "_".join(parts[1:])) if len(parts) == 3 else ("", "", "")
 
 
-def is_relative(unit: str) -> bool:
-    """Whether a word in brackets says that heights count from the ground or the take-off point."""
-    return bool(_RELATIVE.fullmatch(_bare(unit)))
-
-
 def factor(where: str, column: str, unit: str, kind: Kind) -> float:
     """Metres or degrees of one unit of a column. unit: as it stands there, "" for the usual one.
 
     Raises ConfigError where it is none of this kind.
     """
-    parts = [part for part in re.split(r"[,;/|]", unit) if part.strip()]
-    found = [_UNITS[kind][_bare(part)] for part in parts if _bare(part) in _UNITS[kind]]
-    others = [part.strip() for part in parts if _bare(part) not in _UNITS[kind] and not _is_silent(part)]
+    parts = [_without_silent(part) for part in re.split(r"[,;/|]", unit) if part.strip()]
+    found = [_UNITS[kind][bare(part)] for part in parts if bare(part) in _UNITS[kind]]
+    others = [part.strip() for part in parts if bare(part) not in _UNITS[kind] and not _is_silent(part)]
     if len(set(found)) > 1 or others:
         usual = "m, ft, us-ft, km, cm or mm" if kind == "length" else "deg, gon or rad"
         raise ConfigError(
@@ -111,66 +91,15 @@ def factor(where: str, column: str, unit: str, kind: Kind) -> float:
     return found[0] if found else 1.0
 
 
+def _without_silent(text: str) -> str:
+    """`ft` of `NAVD88 ft`; the text where nothing is left, or it is known as it is."""
+    if kind_of(text) or _is_silent(text):
+        return text
+    return " ".join(word for word in text.split() if not _is_silent(word)) or text
+
+
 def _is_silent(text: str) -> bool:
-    return _bare(text) in _SILENT or bool(_DATUMS.fullmatch(_bare(text)))
-
-
-def _bare(text: str) -> str:
-    return re.sub(r"[\s._-]+", "", text.lower())
-
-
-def stated_units(lines: Iterable[str], mark: str = "#") -> dict[str, str]:
-    """What comments say of units: "heights", "angles", "coordinates", "accuracies" or "units" -> the unit, and
-    "relative" -> the words of one that says that heights count from the ground, "datum" -> that name another zero.
-
-    `# angles in gon`, `# heights: ellipsoidal, feet`: the unit follows the subject at once; other comments say nothing.
-    """
-    found: dict[str, str] = {}
-    for line in lines:
-        text = line.strip().lower()
-        if not text.startswith(mark):
-            continue
-        words = [word for word in re.split(r"[\s,;:=()\[\]/]+", text.strip(mark)) if word]
-        for what, subjects in _SUBJECTS.items():
-            for subject in subjects:
-                start = subject.split()
-                if words[: len(start)] != start:
-                    continue
-                unit, relative = _unit_of(words[len(start) :])
-                if unit:
-                    found.setdefault(what, unit)
-                if relative and what == "heights":
-                    found.setdefault("relative", line.strip())
-                if what == "heights" and _names_datum(words[len(start) :]):
-                    found.setdefault("datum", line.strip())
-    return found
-
-
-def _names_datum(words: list[str]) -> bool:
-    spans = (words[first : first + count] for first in range(len(words)) for count in (1, 2, 3))
-    return any(_DATUMS.fullmatch(_bare("".join(span))) for span in spans)
-
-
-def heights_named(comment: str) -> str:
-    """What heights count from by a comment of theirs, as of `crs.heights_of`; "" where it names no zero, or several."""
-    words = re.split(r"[\s,;:=()\[\]/#]+", comment.lower())
-    found = {_ZEROS[word] for word in map(_bare, words) if word in _ZEROS}
-    return found.pop() if len(found) == 1 else ""
-
-
-def _unit_of(words: list[str]) -> tuple[str, bool]:
-    """The unit that stands first behind linking words, "" for none, and whether they say that heights are relative."""
-    for count in range(len(words)):
-        for length in (3, 2, 1):
-            text = _bare("".join(words[count : count + length]))
-            if any(text in units and text not in ("m",) for units in _UNITS.values()):
-                return text, False
-            if _RELATIVE.fullmatch(text):
-                return "", True
-        word = words[count]
-        if word not in _LINKS and not _DATUMS.fullmatch(_bare(word)):
-            break
-    return "", False
+    return bare(text) in _SILENT or is_datum(text)
 
 
 _NUMBER = r"\d+(?:[.,]\d+)?"
@@ -238,7 +167,7 @@ def metres_of(text: str, usual_m: float = 1.0) -> float | None:
     match = re.fullmatch(r"([-+]?[\d.,]+(?:e[-+]?\d+)?|nan|[-+]?inf(?:inity)?)\s*([a-z][a-z _-]*)?", text, re.I)
     if match is None:
         return None
-    number, unit = match[1], _bare(match[2] or "")
+    number, unit = match[1], bare(match[2] or "")
     if unit and unit not in _METRES:
         return None
     try:
@@ -248,6 +177,16 @@ def metres_of(text: str, usual_m: float = 1.0) -> float | None:
     return value * (_METRES[unit] if unit else usual_m)
 
 
+def is_same(one: str, other: str) -> bool:
+    """Whether two names of units are those of one."""
+    return one == other or any(units.get(one, 1.0) == units.get(other, 2.0) for units in _UNITS.values())
+
+
+def is_usual(unit: str) -> bool:
+    """Whether a unit is the metre or the degree."""
+    return any(units.get(bare(unit)) == 1.0 for units in _UNITS.values())
+
+
 def kind_of(unit: str) -> Kind | None:
     """Of what a unit is one, None for none that is known."""
-    return next((kind for kind, units in _UNITS.items() if _bare(unit) in units), None)
+    return next((kind for kind, units in _UNITS.items() if bare(unit) in units), None)

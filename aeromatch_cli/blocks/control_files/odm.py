@@ -8,7 +8,8 @@ every point in every image, separated by blanks, tabs, commas or semicolons:
 im_x, im_y: pixels from the upper left corner of the image. A point without a name is known by its coordinates. A point
 with the word "check" (or "checkpoint") behind its name, or whose name begins with CHK-, takes no part in the fit. ODM
 ignores what stands behind the name; two or three positive numbers there are standard deviations in metres, and in
-pixels. Lines that start with # are comments; names of the columns may follow the CRS.
+pixels. Lines that start with # are comments, which may
+state units and, where the first line is missing, the CRS; names of the columns may follow the CRS.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import replace
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
-from aeromatch_cli.blocks.fields import fields_of, with_name
+from aeromatch_cli.blocks.fields import IMAGE, fields_of, with_name
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, coordinate, is_number, units_of_comments
 from aeromatch_cli.errors import ConfigError
@@ -33,10 +34,14 @@ def read_gcp_list(source: Source) -> Survey:
     records = list(source.records())
     if len(records) < 2:
         raise ConfigError(f"{source.path}: no control points: the first line names the CRS, then {_COLUMNS}")
+    said = units_of_comments(source)
     if is_number(fields_of(records[0][1])[0][0]):
-        raise ConfigError(
-            f"{source.at(records[0][0])}: the first line names the CRS of the coordinates, such as EPSG:32633: add it"
-        )
+        if not said.said.crs:
+            raise ConfigError(
+                f"{source.at(records[0][0])}: the first line names the CRS of the coordinates, such as EPSG:32633: "
+                "add it"
+            )
+        records.insert(0, (1, said.said.crs))
     if _is_header(records[1][1]):
         del records[1]
     elif not _starts_with_numbers(records[1][1]):
@@ -44,7 +49,6 @@ def read_gcp_list(source: Source) -> Survey:
             f"{source.path} is no file of control points that is known (it begins with {records[0][1][:60]!r}): write "
             f"the CRS, then {_COLUMNS}; or a table whose first line names label, x, y, z or label, lat, lon, alt"
         )
-    said = units_of_comments(source)
     factors = 1.0, 1.0, 1.0
     if said.across_m or said.up_m:  # what comments state counts before the unit of the CRS
         stated = described_crs(source.at(records[0][0]), records[0][1])
@@ -53,7 +57,7 @@ def read_gcp_list(source: Source) -> Survey:
     points: dict[str, SurveyedPoint] = {}
     marks: list[Mark] = []
     for line, record in records[1:]:
-        point, one = _row(source, line, record, factors)
+        point, one = _row(source, line, record, factors, said.accuracy_m or 1.0)
         known = points.setdefault(point.name, point)
         if any(abs(a - b) > _SAME * max(1.0, abs(a)) for a, b in zip(known.position, point.position, strict=True)):
             raise ConfigError(f"{source.at(line)}: {point.name} has other coordinates than before: one is wrong")
@@ -63,8 +67,14 @@ def read_gcp_list(source: Source) -> Survey:
     remarks = [f"{source.path.name}: {len(named)} points are check points by their name ({_CHECK_NAME}...)"]
     return Survey(
         tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]),
-        remarks=tuple(remarks if named else ()), measured_in=source.path,
+        remarks=(*(remarks if named else ()), *said.remarks(source)), measured_in=source.path, heights=said.said.zero,
     )  # fmt: skip
+
+
+def is_gcp_line(record: str) -> bool:
+    """Whether a line is three coordinates, two pixels and the name of an image."""
+    cells = with_name(fields_of(record)[0], 5)
+    return len(cells) > 5 and all(map(is_number, cells[:5])) and bool(IMAGE.fullmatch(cells[5]))
 
 
 def _is_header(record: str) -> bool:
@@ -78,7 +88,10 @@ def _starts_with_numbers(record: str) -> bool:
     return bool(cells) and is_number(cells[0])
 
 
-def _row(source: Source, line: int, record: str, factors: tuple[float, float, float]) -> tuple[SurveyedPoint, Mark]:
+def _row(
+    source: Source, line: int, record: str, factors: tuple[float, float, float], accuracy_m: float
+) -> tuple[SurveyedPoint, Mark]:
+    """accuracy_m: metres of one unit of accuracies."""
     fields, comma = fields_of(record)
     while fields and not fields[-1]:
         fields.pop()
@@ -97,7 +110,7 @@ def _row(source: Source, line: int, record: str, factors: tuple[float, float, fl
     )
     if not all(0.0 < sigma < float("inf") for sigma in sigmas):
         sigmas = []
-    across_m, up_m, sigma_px = (*sigmas, None, None, None)[:3]
+    across_m, up_m, sigma_px = (*(accuracy_m * one for one in sigmas[:2]), *sigmas[2:], None, None, None)[:3]
     check = any(map(is_check, cells[6:])) or name.upper().startswith(_CHECK_NAME)
     sigmas_m = completed_sigmas_m(z_m=up_m, across_m=across_m)
     point = SurveyedPoint(name, source.at(line), (x, y, z), sigmas_m, check)

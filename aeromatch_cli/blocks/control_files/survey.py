@@ -44,6 +44,7 @@ class Survey:
 
     crs: of the coordinates, as the file states it, None where it does not; crs_where: the place where it stands, or
     belongs. geographic: whether they are degrees, where no CRS is stated. measured_in: the file that has the marks.
+    heights: what they count from, as of `crs.heights_of`, where comments or columns state it.
     """
 
     points: tuple[SurveyedPoint, ...] = ()
@@ -53,6 +54,7 @@ class Survey:
     geographic: bool = False
     remarks: tuple[str, ...] = ()
     measured_in: Path = Path()
+    heights: str = ""
 
 
 def is_check(word: str) -> bool:

@@ -1,7 +1,8 @@
 """Tables of coordinates, and tables of image measurements.
 
 Coordinates, as Pix4D writes them: `label,c1,c2,z[,accuracy_horizontal,accuracy_vertical][,type]`; in degrees the
-latitude stands first; a CRS is not stated, unless a first line is its code, or a .prj of the same name lies beside.
+latitude stands first; a CRS is not stated, unless a first line is its code, a comment names it, or a .prj of the same
+name lies beside.
 With a header the columns go by their names; Metashape's reference is such a table: `# CoordinateSystem: WKT`, then
 `#Label,[Enable,]X/Easting,Y/Northing,Z/Altitude,Accuracy_X_(m),...`, longitude before latitude; what is not enabled is
 a check point. `type`: check points are named as such, all else is a control point. Names of columns and comments may
@@ -19,28 +20,27 @@ import re
 from collections.abc import Mapping, Sequence
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
+from aeromatch_cli.blocks.column_names import (
+    LATITUDE_SIDES,
+    LONGITUDE_SIDES,
+    comments_of_columns,
+    on_side,
+    side,
+    words_of_height,
+)
+from aeromatch_cli.blocks.control_files import odm
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
+from aeromatch_cli.blocks.crs_comments import crs_comment
 from aeromatch_cli.blocks.fields import IMAGE
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, is_number
-from aeromatch_cli.blocks.poses import stated_crs
-from aeromatch_cli.blocks.units import (
-    Kind,
-    degrees_of,
-    factor,
-    is_relative,
-    kind_of,
-    metres_of,
-    named_column,
-    refuse_rounded,
-    stated_units,
-)
+from aeromatch_cli.blocks.statements import Quantity, Statements, statements_of
+from aeromatch_cli.blocks.units import Kind, degrees_of, factor, metres_of, named_column, refuse_rounded
+from aeromatch_cli.blocks.zeros import is_relative, zero_of
 from aeromatch_cli.errors import ConfigError
 
 # A first line of a table that names the CRS alone, as in the lists of points for editors of gcp_list.txt.
 _CODE = re.compile(r"\s*(EPSG:\d+(?:\+\d+)?|\+proj=[^,;\t]*?|WGS\s*84[\s/]+UTM[^,;\t]*?)[\s,;]*", re.IGNORECASE)
-# Where the CRS of a table may stand.
-_HEAD_LINES = 5
 # Of a line below a code.
 _POINT_VALUES = 4
 _LARGEST_LONGITUDE_DEG = 180.0
@@ -63,6 +63,7 @@ _COORDINATES: Mapping[str, str] = {
     **dict.fromkeys(("cs_name", "crs", "srs", "epsg", "coordinate_system"), "crs"),
     **{"easting_rms": "sigma_x", "northing_rms": "sigma_y", "elevation_rms": "sigma_z", "lateral_rms": "sigma_xy"},
     **dict.fromkeys(("enable", "enabled"), "enable"),
+    **dict.fromkeys(LATITUDE_SIDES, "lat_side") | dict.fromkeys(LONGITUDE_SIDES, "lon_side"),
     **{f"accuracy_{name}".rstrip("_"): f"sigma_{side}" for name, side in _SIDES.items()},
     **{f"{name}_accuracy": f"sigma_{side}" for name, side in _SIDES.items() if name},
     **{f"sigma_{name}": f"sigma_{side}" for name, side in _SIDES.items() if name},
@@ -78,6 +79,8 @@ _MARKS: Mapping[str, str] = {
 
 def is_coordinates(source: Source) -> bool:
     """Whether a file is a table of points with three coordinates each."""
+    if odm.is_gcp_line(next((record for _, record in source.records()), "")):
+        return False
     header, names, _ = _header(source, _COORDINATES)
     if header:
         return {"label", "z"} <= set(names) and ({"x", "y"} <= set(names) or {"longitude", "latitude"} <= set(names))
@@ -91,6 +94,8 @@ def _is_points(cells: Sequence[str]) -> bool:
 
 def is_marks(source: Source) -> bool:
     """Whether a file is a table of image measurements."""
+    if odm.is_gcp_line(next((record for _, record in source.records()), "")):
+        return False
     header, names, _ = _header(source, _MARKS)
     if {"image", "label", "x", "y"} <= set(names):
         return True
@@ -106,25 +111,51 @@ def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
     """usual_crs: of grid coordinates where the file names none. Raises ConfigError with file and line."""
     header, names, units = _header(source, _COORDINATES)
     records = list(_rows(source, header))
-    crs, crs_where = _stated_crs(source)
+    said, more = _statements(source, header, records)
+    crs, crs_where = _stated_crs(source, said, geographic="latitude" in names)
     crs = crs or _crs_of_column(source, names, records)
     names, remarks = _one_form(source, names, crs)
+    remarks += tuple(
+        f"{source.path.name}: {words}" for words in (*more, *said.remarks, *(() if crs else said.not_whole))
+    )
     rows = [
         (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
         for line, cells, _ in records
     ]
-    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys("xyz", "")
-    points = _points(source, rows, _factors(source, header, stated, crs or usual_crs, crs_where))
+    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys((*"xyz", "sigma_xy", "sigma_z"), "")
+    points = _points(source, rows, _factors(source, header, stated, said, crs or usual_crs, crs_where))
     geographic = "latitude" in names or _in_degrees(points)
     if crs is None and usual_crs is not None and geographic:
-        points = _points(source, rows, _factors(source, header, stated, None, crs_where))
+        points = _points(source, rows, _factors(source, header, stated, said, None, crs_where))
     elif crs is None:
         crs = usual_crs
     if not header and crs is None and geographic:  # the latitude stands first
         points = [_exchanged(point) for point in points]
     if "latitude" in names and crs is not None and described_crs(crs_where, crs).kind == "grid":
         crs = None  # of coordinates that the file does not have
-    return Survey(tuple(points), (), crs, crs_where, geographic, remarks)
+    zero = zero_of(re.split(r"[\s_,;/.-]+", _cell_of_heights(source, header, names))) or said.zero
+    return Survey(tuple(points), (), crs, crs_where, geographic, remarks, heights=zero)
+
+
+def _statements(
+    source: Source, header: int, records: Sequence[tuple[int, list[str], bool]]
+) -> tuple[Statements, list[str]]:
+    """What comments and columns of units state, and what these columns cannot. Raises ConfigError."""
+    lines = [text for line, text in enumerate(source.lines, start=1) if line != header]
+    if not header:
+        return statements_of(lines), []
+    cells, _ = _cells(source.lines[header - 1].strip().lstrip("#").strip())
+    columns = [re.sub(r"[\s-]+", "_", cell.strip().lower()) for cell in cells]
+    rows = (dict(enumerate(cells)) for _, cells, _ in records)
+    comments, _, remarks = comments_of_columns(source.at(header), columns, rows)
+    return statements_of([*comments, *lines]), remarks
+
+
+def _cell_of_heights(source: Source, header: int, names: Sequence[str]) -> str:
+    """The name of the column of heights as it stands in the header."""
+    if not header or "z" not in names:
+        return ""
+    return _cells(source.lines[header - 1].strip().lstrip("#").strip())[0][list(names).index("z")].lower()
 
 
 def _points(
@@ -194,7 +225,8 @@ def _header(source: Source, known: Mapping[str, str]) -> tuple[int, list[str], l
     canonical, code = frozenset(known.values()), _line_of_code(source) if known is _COORDINATES else 0
     for line, text in enumerate(source.lines, start=1):
         stripped = text.strip()
-        if not stripped or stated_crs([stripped]) or line == code:
+        system = crs_comment(stripped)
+        if not stripped or (system is not None and system.crs) or line == code:
             continue
         cells, _ = _cells(stripped.lstrip("#").strip())
         columns = [_column(cell, known) for cell in cells]
@@ -211,28 +243,31 @@ def _column(cell: str, known: Mapping[str, str]) -> tuple[str, str]:
     if len(cell) > 100:
         return "", ""  # no name
     name, unit = named_column(re.sub(r"^\s*[xyz]/(?=[a-z]{2})", "", cell, flags=re.IGNORECASE), known)
+    if known is _COORDINATES and name not in known.values() and words_of_height(cell)[0]:
+        name, unit = "z", words_of_height(cell)[1]
     return ("", "") if name == "z" and is_relative(unit) else (name, unit)
 
 
-def _factors(source: Source, line: int, stated: Mapping[str, str], crs: str | None, crs_where: str) -> dict[str, float]:
+def _factors(
+    source: Source, line: int, stated: Mapping[str, str], said: Statements, crs: str | None, crs_where: str
+) -> dict[str, float]:
     """Metres or degrees of one unit of every column: by its name, else by what a comment says; of coordinates in a CRS
     as shares of its own units. stated: the units that the names state. Raises ConfigError."""
-    said = stated_units(source.lines)
-    if "relative" in said:
+    if said.relative:
         raise ConfigError(
-            f"{source.path}: {said['relative']!r} says that heights do not count from a datum: give heights above the "
+            f"{source.path}: {said.relative!r} says that heights do not count from a datum: give heights above the "
             "ellipsoid or sea level"
         )
     found = {}
     for name, unit in stated.items():
-        subjects: tuple[str, ...]
+        quantities: tuple[Quantity, ...] = ("across", "coordinates", "all")
         kind: Kind = "angle" if name in ("longitude", "latitude") else "length"
         if name in ("longitude", "latitude", "x", "y", "z") or name.startswith("sigma_"):
-            subjects = ("heights", "coordinates", "units") if name == "z" else ("coordinates", "units")
-            if name.startswith("sigma_"):
-                subjects = ("accuracies",)
-            others = (text for subject in subjects if kind_of(text := said.get(subject, "")) == kind)
-            text = unit or next(others, "")
+            if name == "z":
+                quantities = ("heights", "coordinates", "all")
+            elif name.startswith("sigma_"):
+                quantities = ("accuracies",)
+            text = unit or said.unit(kind, *quantities)
             if text:
                 found[name] = factor(source.at(line), name, text, kind)
     if crs is not None and found.keys() & set("xyz"):  # what the columns state counts before the unit of the CRS
@@ -265,6 +300,9 @@ def _point(source: Source, line: int, record: Mapping[str, str], factors: Mappin
         if column in ("longitude", "latitude"):
             degrees = degrees_of(cell, "EW" if column == "longitude" else "NS")
             found = None if degrees is None else degrees * unit
+            place, sides = ("lon_side", "EW") if column == "longitude" else ("lat_side", "NS")
+            where = source.at(line, f"{column}, side")
+            found = None if found is None else on_side(where, found, side(where, record.get(place, ""), sides))
         else:
             refuse_rounded(source.at(line, column), cell)
             found = metres_of(cell, unit)
@@ -289,18 +327,20 @@ def _sigmas_m(record: Mapping[str, str], factors: Mapping[str, float]) -> Sigmas
     return completed_sigmas_m(x, y, z, across_m=across, overall_m=overall)
 
 
-def _stated_crs(source: Source) -> tuple[str | None, str]:
-    """CRS and its place: in the file, or in a .prj beside it."""
+def _stated_crs(source: Source, said: Statements, *, geographic: bool) -> tuple[str | None, str]:
+    """CRS and its place: in the file, or in a .prj beside it. geographic: of degrees, which a datum alone states."""
     code = _line_of_code(source)
-    for line, text in enumerate(source.lines[:_HEAD_LINES], start=1):
-        stated = _CODE.fullmatch(text) if line == code else None
-        found = stated[1] if stated else stated_crs([text])
-        if found:
-            return found, source.at(line)
-    beside = source.beside(source.path.with_suffix(".prj").name)
-    if beside is not None and beside.text.strip():
-        return beside.text.strip(), str(beside.path)
-    return None, str(source.path)
+    stated = _CODE.fullmatch(source.lines[code - 1]) if code else None
+    found = stated[1] if stated else said.crs_of(grid=not geographic)
+    if found:
+        return found, source.at(code or _line_of_crs(source))
+    beside, where = source.crs_beside()
+    return (beside, where) if beside else (None, str(source.path))
+
+
+def _line_of_crs(source: Source) -> int:
+    found = (line for line, text in enumerate(source.lines, start=1) if (one := crs_comment(text)) and one.crs)
+    return next(found, 1)
 
 
 def _crs_of_column(source: Source, names: Sequence[str], records: Sequence[tuple[int, list[str], bool]]) -> str | None:

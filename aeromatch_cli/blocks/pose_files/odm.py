@@ -39,8 +39,8 @@ _LIKE_SIGMAS = 1.0
 
 
 def is_geo_txt(source: Source) -> bool:
-    first = next((line for line in source.lines if line.strip()), "")
-    return bool(_CRS.fullmatch(first.strip()))
+    first = next((record for _, record in source.records()), "")
+    return bool(_CRS.fullmatch(first))
 
 
 def read_geo_txt(source: Source) -> PoseList:
@@ -60,7 +60,8 @@ def read_geo_txt(source: Source) -> PoseList:
         values = [_value(source.at(line, f"{column}"), cell, comma) for column, cell in enumerate(fields[1:9], start=2)]
         x, y, z = [*values, np.nan, np.nan][:3]
         angles = [turn_deg * angle for angle in values[3:6]] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
-        across_m, up_m = values[6:8] if len(fields) >= _WITH_ACCURACIES else (None, None)
+        one_m = said.accuracy_m or 1.0
+        across_m, up_m = (one_m * one for one in values[6:8]) if len(fields) >= _WITH_ACCURACIES else (None, None)
         as_written.append((x, y))
         place = stated.position(source.at(line), x, y, z)
         whole = bool(np.isfinite(angles).all())
@@ -74,11 +75,11 @@ def read_geo_txt(source: Source) -> PoseList:
         )  # fmt: skip
     given = [row.attitude for row in rows if row.attitude is not None]
     words = "yaw, pitch, roll" if given else "positions"
-    remarks = (*stated.remarks, *like_utm(stated, as_written))
+    remarks = (*stated.remarks, *like_utm(stated, as_written), *said.remarks(source))
     if given and len(rows) >= 3 and all(0.0 < angle < _LIKE_SIGMAS for three in given for angle in three):
         remarks += (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
     title = f"ODM geo.txt, {text}, {words}"
-    return PoseList(tuple(rows), stated.kind, remarks, title, stated.crs, heights=stated.heights)
+    return PoseList(tuple(rows), stated.kind, remarks, title, stated.crs, heights=stated.heights or said.said.zero)
 
 
 def _value(where: str, cell: str, comma: bool) -> float:

@@ -60,7 +60,8 @@ def read_geolocation(source: Source, angles: str = "") -> PoseList:
         ]
         across_m, up_m, angle_deg = (one or 1.0 for one in (said.across_m, said.up_m, said.angle_deg))
         units = [across_m, across_m, up_m, *([angle_deg] * 3 if len(values) >= 6 else [])]
-        values[: len(units)] = [a * b for a, b in zip(values, units, strict=False)]
+        units += [said.accuracy_m or 1.0] * (len(values) - len(units))
+        values = [a * b for a, b in zip(values, units[: len(values)], strict=True)]
         table.append((line, cells[0], values))
     places = np.array([values[:2] for _, _, values in table])
     kind: PositionKind = "geographic" if np.abs(places).max() <= 180.0 else "grid"
@@ -69,7 +70,7 @@ def read_geolocation(source: Source, angles: str = "") -> PoseList:
     chosen = angles or _likely_angles(attitudes)
     form: AttitudeKind = "omega_phi_kappa" if chosen == "opk" else "yaw_pitch_roll"
     rows = tuple(_row(line, name, values, kind, exchanged, form) for line, name, values in table)
-    remarks = []
+    remarks = list(said.remarks(source))
     words = "positions"
     if len(attitudes):
         words = "omega, phi, kappa" if chosen == "opk" else "yaw, pitch, roll"
@@ -81,7 +82,8 @@ def read_geolocation(source: Source, angles: str = "") -> PoseList:
     if exchanged:
         remarks.append(f"{source.path.name}: longitude stands before latitude, as numbers beyond 90 show")
     where = "latitude, longitude" if kind == "geographic" else "grid"
-    return PoseList(rows, kind, tuple(remarks), f"Pix4D geolocation, {where}, {words}")
+    title = f"Pix4D geolocation, {where}, {words}"
+    return PoseList(rows, kind, tuple(remarks), title, heights=said.said.zero)
 
 
 def _likely_angles(attitudes: np.ndarray) -> str:

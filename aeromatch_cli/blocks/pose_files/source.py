@@ -15,13 +15,17 @@ import numpy as np
 from aeromatch_cli.blocks.gis_columns import with_coordinates
 from aeromatch_cli.blocks.lenses import remark
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
-from aeromatch_cli.blocks.units import Kind, factor, kind_of, refuse_rounded, stated_units
+from aeromatch_cli.blocks.statements import Quantity, Statements, statements_of
+from aeromatch_cli.blocks.units import Kind, factor, refuse_rounded
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
 from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import to_quaternion
 
+_CRS_TEXT = re.compile(
+    r"(PROJ|GEOG|COMPD|GEOD|BOUND|COMPOUND|LOCAL_|ENG|ENGINEERING)(CS|CRS)\[|\+proj=|EPSG:", re.IGNORECASE
+)
 # A file that is longer is no list of poses; a reconstruction with its points may be large.
 _LARGEST_BYTES = 2_000_000_000
 
@@ -117,6 +121,15 @@ class Source:
         folder = self.path if self.is_folder else self.path.parent
         return next((Source(folder / name) for name in names if (folder / name).is_file()), None)
 
+    def crs_beside(self) -> tuple[str, str]:
+        """The CRS that a .prj of the same name states, and its place; "" for none. A project of Inpho ends so, too."""
+        stem = self.path.stem
+        found = (
+            None if self.is_folder or self.path.suffix.lower() == ".prj" else self.beside(f"{stem}.prj", f"{stem}.qpj")
+        )
+        text = found.text.strip() if found else ""
+        return (text, str(found.path)) if found and _CRS_TEXT.match(text) else ("", "")
+
     def at(self, line: int, column: str = "") -> str:
         """A place for messages."""
         return f"{self.path}, line {line}" + (f", column {column}" if column else "")
@@ -124,29 +137,36 @@ class Source:
 
 @dataclass(frozen=True)
 class Units:
-    """Metres of one unit of x and y, and of a height, degrees of one unit of angles, None where nothing says so."""
+    """Metres of one unit of x and y, of a height, and of accuracies, degrees of one unit of angles, None where nothing
+    says so; and all that comments state."""
 
     across_m: float | None = None
     up_m: float | None = None
     angle_deg: float | None = None
+    accuracy_m: float | None = None
+    said: Statements = field(default_factory=Statements)
+
+    def remarks(self, source: Source) -> tuple[str, ...]:
+        not_whole = [] if self.said.crs else self.said.not_whole
+        return tuple(f"{source.path.name}: {words}" for words in (*self.said.remarks, *not_whole))
 
 
 def units_of_comments(source: Source) -> Units:
     """What the comments of a file without header say. Raises ConfigError where heights do not count from a datum."""
-    said = stated_units(source.lines)
-    if "relative" in said:
+    said = statements_of(source.lines)
+    if said.relative:
         raise ConfigError(
-            f"{source.path}: {said['relative']!r} says that heights do not count from a datum: leave them out, or give "
+            f"{source.path}: {said.relative!r} says that heights do not count from a datum: leave them out, or give "
             "heights above the ellipsoid or sea level"
         )
 
-    def of(kind: Kind, *subjects: str) -> float | None:
-        text = next((said[one] for one in subjects if kind_of(said.get(one, "")) == kind), "")
-        return factor(str(source.path), subjects[0], text, kind) if text else None
+    def of(kind: Kind, *quantities: Quantity) -> float | None:
+        text = said.unit(kind, *quantities)
+        return factor(str(source.path), quantities[0], text, kind) if text else None
 
     return Units(
-        of("length", "coordinates", "units"), of("length", "heights", "coordinates", "units"),
-        of("angle", "angles", "units"),
+        of("length", "across", "coordinates", "all"), of("length", "heights", "coordinates", "all"),
+        of("angle", "angles", "all"), of("length", "accuracies"), said,
     )  # fmt: skip
 
 

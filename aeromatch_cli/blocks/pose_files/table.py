@@ -28,6 +28,7 @@ from aeromatch_cli.blocks.pose_files import (
 from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, like_utm
 from aeromatch_cli.blocks.pose_files.source import Source, is_number, units_of_comments, world_beside
 from aeromatch_cli.blocks.poses import PoseList, has_header, is_track, read_poses
+from aeromatch_cli.blocks.statements import statements_of
 from aeromatch_cli.errors import ConfigError
 
 AUTO = "auto"
@@ -36,31 +37,39 @@ AUTO = "auto"
 @dataclass(frozen=True)
 class PoseFormat:
     """title: in words. read: raises ConfigError with file, line and column. recognises: None where only its name asks
-    for it."""
+    for it. plain: comments of a list, or a .prj beside it, may name its CRS."""
 
     title: str
     read: Callable[[Source], PoseList]
     recognises: Callable[[Source], bool] | None = None
+    plain: bool = False
 
 
 def _named_columns(source: Source) -> PoseList:
     """orientation.csv of this program counts in the CRS that its neighbours name."""
     found = read_poses(source.path)
     if found.crs is not None:
-        return _in_stated_crs(source, found)
+        return _in_stated_crs(source, found, found.crs, str(source.path))
     crs, _ = world_beside(source)
     own = source.name == "orientation.csv" and found.position_kind == "grid" and crs is not None
-    return replace(found, crs=crs, format="orientation.csv of aeromatch") if own else found
+    return replace(found, crs=crs, format="orientation.csv of aeromatch") if own else _as_plain(source, found)
 
 
-def _in_stated_crs(source: Source, found: PoseList) -> PoseList:
-    """Of a list whose comment, or a column, names the CRS."""
-    stated = described_crs(str(source.path), found.crs or "")
+def _as_plain(source: Source, found: PoseList) -> PoseList:
+    """Of a list whose lines do not name the CRS: by its comments, else by a .prj beside it."""
+    comment = statements_of(source.lines).crs_of(grid=found.position_kind == "grid")
+    text, where = (comment, str(source.path)) if comment else source.crs_beside()
+    return _in_stated_crs(source, found, text, where) if text else found
+
+
+def _in_stated_crs(source: Source, found: PoseList, text: str, where: str) -> PoseList:
+    """Of a list whose CRS is stated by a text."""
+    stated = described_crs(where, text)
     if found.position_kind == "geographic" and stated.kind == "grid":  # the world's
         return replace(found, crs=stated.crs, heights=stated.heights or found.heights)
     grid = found.position_kind == "grid"
     if grid:  # what columns state counts before the unit of the CRS
-        found = read_poses(source.path, (stated.across_m, stated.up_m))
+        found = _in_units(source, found, (stated.across_m, stated.up_m))
     one = replace(stated, across_m=1.0, up_m=1.0)
     rows = []
     for row in found.rows:
@@ -73,14 +82,23 @@ def _in_stated_crs(source: Source, found: PoseList) -> PoseList:
     words, warnings = f"{found.format}, {stated.name}", (*stated.remarks, *said, *found.warnings)
     heights = stated.heights or found.heights
     return replace(
-        found,
-        rows=tuple(rows),
-        position_kind=one.kind,
-        crs=one.crs,
-        warnings=warnings,
-        format=words,
-        heights=heights,
+        found, rows=tuple(rows), position_kind=one.kind, crs=one.crs, warnings=warnings, format=words, heights=heights
     )
+
+
+def _in_units(source: Source, found: PoseList, usual_m: tuple[float, float]) -> PoseList:
+    """In metres, of a list without units of its own. usual_m: metres of one unit of x and y, and of heights; what
+    columns and comments state counts before them."""
+    if found.format == PoseList.format:
+        return read_poses(source.path, usual_m)
+    said = units_of_comments(source)
+    across_m, up_m = 1.0 if said.across_m else usual_m[0], 1.0 if said.up_m else usual_m[1]
+    rows = []
+    for row in found.rows:
+        x, y, z = row.position or (0.0, 0.0, 0.0)
+        place = None if row.position is None else (x * across_m, y * across_m, z * up_m)
+        rows.append(replace(row, position=place))
+    return replace(found, rows=tuple(rows))
 
 
 _MISSION_PLANNER = re.compile(r"#\s*name\s+latitude/y\s+longitude/x\b.*", re.IGNORECASE)
@@ -122,7 +140,7 @@ POSE_FORMATS: Mapping[str, PoseFormat] = {
     "odm": PoseFormat("ODM geo.txt", odm.read_geo_txt, odm.is_geo_txt),
     "dji-mrk": PoseFormat("DJI *_Timestamp.MRK", dji.read_mrk, dji.is_mrk),
     "mission-planner": PoseFormat("Mission Planner location.txt", _mission_planner, _is_mission_planner),
-    "bingo": PoseFormat("BINGO's records ORIA", tables.read_oria, tables.is_oria),
+    "bingo": PoseFormat("BINGO's records ORIA", tables.read_oria, tables.is_oria, plain=True),
     "bundler": PoseFormat("Bundler .out with list.txt", scenes.read_bundler, scenes.is_bundler),
     "nvm": PoseFormat("VisualSFM .nvm", scenes.read_nvm, scenes.is_nvm),
     "inpho": PoseFormat("Inpho project .prj", tables.read_inpho, tables.is_inpho),
@@ -130,17 +148,17 @@ POSE_FORMATS: Mapping[str, PoseFormat] = {
         "Pix4D *_calibrated_camera_parameters.txt", pix4d.read_camera_parameters, pix4d.is_camera_parameters
     ),
     "patb": PoseFormat("PATB orientations", tables.read_patb, tables.is_patb),
-    "pix4d": PoseFormat("Pix4D geolocation without header", pix4d.read_geolocation, pix4d.is_geolocation),
-    "pix4d-opk": PoseFormat("the same with omega, phi, kappa", pix4d.read_as_opk),
-    "pix4d-ypr": PoseFormat("the same with yaw, pitch, roll", pix4d.read_as_ypr),
+    "pix4d": PoseFormat("Pix4D geolocation without header", pix4d.read_geolocation, pix4d.is_geolocation, plain=True),
+    "pix4d-opk": PoseFormat("the same with omega, phi, kappa", pix4d.read_as_opk, plain=True),
+    "pix4d-ypr": PoseFormat("the same with yaw, pitch, roll", pix4d.read_as_ypr, plain=True),
     "table": PoseFormat(
         "name x y z and three angles without header (BINGO, ORIMA, OriExport)", tables.read_plain_table,
-        tables.is_plain_table,
+        tables.is_plain_table, plain=True,
     ),
-    "opk": PoseFormat("the same with omega, phi, kappa in degrees", tables.read_opk),
-    "opk-gon": PoseFormat("the same in gon", tables.read_opk_gon),
-    "pok": PoseFormat("the same with phi, omega, kappa in degrees", tables.read_pok),
-    "pok-gon": PoseFormat("the same in gon", tables.read_pok_gon),
+    "opk": PoseFormat("the same with omega, phi, kappa in degrees", tables.read_opk, plain=True),
+    "opk-gon": PoseFormat("the same in gon", tables.read_opk_gon, plain=True),
+    "pok": PoseFormat("the same with phi, omega, kappa in degrees", tables.read_pok, plain=True),
+    "pok-gon": PoseFormat("the same in gon", tables.read_pok_gon, plain=True),
     "columns": PoseFormat("list whose first line names the columns", _named_columns),
 }  # fmt: skip
 
@@ -182,7 +200,10 @@ def read_pose_file(path: Path, pose_format: str = AUTO, crs: str = AUTO_CRS) -> 
     source = Source(path)
     found = _read(source, pose_format)
     stated = _in_other_units(crs) if found.crs is None and found.position_kind == "grid" else None
-    return found if stated is None else _in_units_of(source, found, stated)
+    if stated is None:
+        return found
+    found = _in_units(source, found, (stated.across_m, stated.up_m))
+    return replace(found, warnings=(*stated.remarks, *found.warnings))
 
 
 def _read(source: Source, pose_format: str) -> PoseList:
@@ -190,11 +211,11 @@ def _read(source: Source, pose_format: str) -> PoseList:
     if pose_format != AUTO:
         if pose_format not in POSE_FORMATS:
             raise ConfigError(f"pose format {pose_format!r} is unknown: use one of auto, {', '.join(POSE_FORMATS)}")
-        return _checked(source, POSE_FORMATS[pose_format].read(source))
+        return _checked(source, POSE_FORMATS[pose_format])
     if source.path.suffix.lower() not in (".zip", ".xlsx") and (source.is_folder or source.raw):
         for known in POSE_FORMATS.values():
             if known.recognises is not None and known.recognises(source):
-                return _checked(source, known.read(source))
+                return _checked(source, known)
     if source.is_folder:
         raise ConfigError(f"pose list {path} is a folder: give a file, a COLMAP model or MicMac's Ori-* folder")
     other = next((words for end, words in _OTHERS.items() if source.name.endswith(end)), "")
@@ -219,23 +240,6 @@ def _in_other_units(crs: str) -> StatedCrs | None:
         return None
     stated = described_crs("--crs", crs)
     return stated if stated.kind == "grid" and (stated.across_m, stated.up_m) != (1.0, 1.0) else None
-
-
-def _in_units_of(source: Source, found: PoseList, stated: StatedCrs) -> PoseList:
-    """In metres. What columns and comments of the file state counts before the units of the CRS."""
-    across_m, up_m = stated.across_m, stated.up_m
-    if found.format == PoseList.format:
-        found = read_poses(source.path, (across_m, up_m))
-    else:
-        said = units_of_comments(source)
-        across_m, up_m = 1.0 if said.across_m else across_m, 1.0 if said.up_m else up_m
-        rows = []
-        for row in found.rows:
-            x, y, z = row.position or (0.0, 0.0, 0.0)
-            place = None if row.position is None else (x * across_m, y * across_m, z * up_m)
-            rows.append(replace(row, position=place))
-        found = replace(found, rows=tuple(rows))
-    return replace(found, warnings=(*stated.remarks, *found.warnings))
 
 
 def _by_content(source: Source) -> str:
@@ -264,8 +268,10 @@ def _by_content(source: Source) -> str:
     return ""
 
 
-def _checked(source: Source, found: PoseList) -> PoseList:
-    """Raises ConfigError for an empty list and for two lines with one name."""
+def _checked(source: Source, known: PoseFormat) -> PoseList:
+    """What a format reads. Raises ConfigError for an empty list and for two lines with one name."""
+    found = known.read(source)
+    found = _as_plain(source, found) if known.plain and found.crs is None else found
     if not found.rows:
         raise ConfigError(f"{source.path}: no image in this {found.format}")
     lines: dict[str, int] = {}

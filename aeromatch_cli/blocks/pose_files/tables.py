@@ -99,7 +99,8 @@ def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseLis
             f"{source.path.name}: no header says what the angles are; they are read as {words}; --pose-format opk, "
             "opk-gon, pok or pok-gon reads them otherwise",
         )
-    return PoseList(tuple(rows), "grid", remarks, f"table without header, {words}")
+    title = f"table without header, {words}"
+    return PoseList(tuple(rows), "grid", (*remarks, *said.remarks(source)), title, heights=said.said.zero)
 
 
 read_opk, read_opk_gon = (
@@ -120,23 +121,26 @@ def is_oria(source: Source) -> bool:
 
 def read_oria(source: Source) -> PoseList:
     """Raises ConfigError with line and column."""
-    rows, more = [], False
+    rows, more, said = [], False, units_of_comments(source)
+    metres = said.across_m or 1.0, said.across_m or 1.0, said.up_m or 1.0
     for line, record in source.records():
         cells = words_of(record)
         if cells[0] != _ORIA:
             continue
         values = numbers(source.at(line), cells[2:], ("x", "y", "z", "omega", "phi", "kappa"))
         more |= len(cells) > 2 + len(values)
-        omega, phi, kappa = (_GON_DEG * angle for angle in values[3:])
+        omega, phi, kappa = ((said.angle_deg or _GON_DEG) * angle for angle in values[3:])
+        x, y, z = (value * one for value, one in zip(values, metres, strict=False))
         rows.append(
             PoseRow(
-                image=image_name(cells[1]), line=line, position=(values[0], values[1], values[2]),
+                image=image_name(cells[1]), line=line, position=(x, y, z),
                 position_kind="grid", attitude=(omega, phi, kappa), attitude_kind="omega_phi_kappa",
                 numbered=is_number(cells[1]),
             )
         )  # fmt: skip
     remarks = (f"{source.path.name}: what stands behind kappa in {_ORIA} is not read",) if more else ()
-    return PoseList(tuple(rows), "grid", remarks, f"BINGO, {_ORIA}, omega, phi, kappa in gon")
+    title = f"BINGO, {_ORIA}, omega, phi, kappa in {'the unit of a comment' if said.angle_deg else 'gon'}"
+    return PoseList(tuple(rows), "grid", (*remarks, *said.remarks(source)), title, heights=said.said.zero)
 
 
 def is_patb(source: Source) -> bool:
