@@ -135,8 +135,8 @@ def _two_levels(facts: Mapping[str, ExifFacts]) -> list[str]:
     step_m = float(np.median(upper) - np.median(lower))
     return [
         f"the altitudes lie on two levels, {step_m:.0f} m apart: {lower[0]:.0f} to {lower[-1]:.0f} m in "
-        f"{_some(sorted(names[:first]), facts)}, {upper[0]:.0f} to {upper[-1]:.0f} m in the others. If all were flown at "
-        "one height, one level counts from the take-off point and the other from sea level, and the block comes out "
+        f"{_some(sorted(names[:first]), facts)}, {upper[0]:.0f} to {upper[-1]:.0f} m in the others. If all were flown "
+        "at one height, one level counts from the take-off point and the other from sea level, and the block comes out "
         "tilted: give altitudes of one kind with --poses"
     ]
 

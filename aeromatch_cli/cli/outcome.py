@@ -39,6 +39,8 @@ class PairsFacts(Facts):
         "arbitrary, and lengths are null.",
     )
     warnings: list[str] = Field([], description="What a person should look at.")
+    urgent: list[str] = Field([], description="Those of the warnings that --quiet does not hide.")
+    unread: dict[str, str] = Field({}, description="Picture of a kind that is not read -> reason.")
 
 
 class MatchFacts(Facts):

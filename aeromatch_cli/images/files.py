@@ -24,6 +24,8 @@ from aeromatch_cli.images.png import SIGNATURE, chunks
 # announce (ITU T.81, table B.1): frames, tables, scans, application data, comments.
 _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
 
+# Of files that hold a JPEG.
+JPEG_SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif")
 _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
@@ -55,7 +57,7 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
         pixels, valid = gdal.read_bands(path)
     else:
         # Gray straight from the decoder is fastest, but it would cast a 16-bit PNG to 8 bit.
-        straight = not colour and path.suffix.lower() in (".jpg", ".jpeg")
+        straight = not colour and path.suffix.lower() in JPEG_SUFFIXES
         flag = cv2.IMREAD_GRAYSCALE if straight else cv2.IMREAD_UNCHANGED
         pixels = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
         if pixels.ndim == 3 and pixels.shape[2] == 4:
@@ -195,7 +197,7 @@ def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
 
     # As it is stored: of 16 bits, gray from the decoder would be 0 below 256, and of colours where they are faint. But
     # a JPEG's colours are noise around zero.
-    flag = cv2.IMREAD_GRAYSCALE if path.suffix.lower() in (".jpg", ".jpeg") else cv2.IMREAD_UNCHANGED
+    flag = cv2.IMREAD_GRAYSCALE if path.suffix.lower() in JPEG_SUFFIXES else cv2.IMREAD_UNCHANGED
     try:
         stored = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
     except ItemError as error:

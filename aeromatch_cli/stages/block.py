@@ -45,7 +45,8 @@ _GSD_TOLERANCE = 0.1
 class BlockRead:
     """A block as it is given, with what was learnt on the way.
 
-    recognised, flights, velocities: as in `read.BlockInputs`. gsd_before_m: gsd_m and
+    recognised, unread, flights, velocities: as in `read.BlockInputs`. urgent: warnings that are said even where quiet
+    is asked for: of pictures that are not read, and of control points none of which is used. gsd_before_m: gsd_m and
     reduced_gsd_m that the workspace had, or None.
     ground_hint: the ground below relative altitudes, and its source.
     """
@@ -60,6 +61,8 @@ class BlockRead:
     control: tuple[ControlPoint, ...]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
+    unread: tuple[tuple[str, str], ...]
+    urgent: frozenset[str]
     recognised: str
     remote: Mapping[str, RemoteFile]
     gsd_before_m: tuple[float | None, float | None]
@@ -106,6 +109,13 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         control=control,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
+        unread=tuple((one.name, one.reason) for one in inputs.unread),
+        urgent=frozenset(
+            [
+                *(line for line in inputs.warnings if any(line.endswith(one.reason) for one in inputs.unread)),
+                *(absent if not control else ()),
+            ]
+        ),
         recognised=inputs.recognised,
         remote=remote,
         gsd_before_m=(before.get("gsd_m"), before.get("reduced_gsd_m"))

@@ -141,8 +141,7 @@ def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> R
     block = next(report for report in reports if report.stage == "pairs")
     for line in block.facts["summary"]:
         said(line)
-    for warning in block.facts["warnings"]:
-        log.warning("warning: %s", warning)
+    pairs.warn(block.facts["warnings"], block.facts.get("urgent", ()))
     return _result("run", settings, workspace, names, reports, (), said)
 
 
@@ -373,9 +372,10 @@ def _result(
     quality, told = _quality(command, workspace, reports, names, part=part)
     lost, urgent = list[Lost](), list[str]()
     if quality is not None:
-        lost = lost_images(told, first.failures, names)
+        unread = [*first.failures, *first.facts.get("unread", {}).items()]
+        lost = lost_images(told, unread, names)
         write_lost(workspace, lost)
-        told_lost = lost_lines(workspace, lost, len(names) + len(first.failures))
+        told_lost = lost_lines(workspace, lost, len(names) + len(unread))
         lines += [*closing_lines(quality, told, names), *told_lost]
         urgent = [*([] if quality.verdict == "good" else verdict_lines(quality)), *told_lost]
     lines.append(f"workspace {workspace.root}")
@@ -453,9 +453,7 @@ def _check(context: Context, oriented: StageReport, first: StageReport, said: _S
     settled = bool(oriented.facts) or not isinstance(context.settings.orient, FirstPass)
     quality = picture_quality.measured(context)
     looks = picture_quality.remarks(context, quality)
-    for warning in looks:
-        if warning not in first.facts["warnings"]:
-            log.warning("warning: %s", warning)
+    pairs.warn(warning for warning in looks if warning not in first.facts["warnings"])
     found = check.run(context, time.perf_counter() - first.started, len(first.failures), oriented=settled)
     lines = (*said.rest(first.facts["summary"]), *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])

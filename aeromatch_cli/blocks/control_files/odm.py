@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
-from aeromatch_cli.blocks.fields import fields_of, with_name
+from aeromatch_cli.blocks.fields import IMAGE, fields_of, with_name
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, coordinate, is_number, units_of_comments
 from aeromatch_cli.errors import ConfigError
@@ -50,20 +50,25 @@ def read_gcp_list(source: Source) -> Survey:
         stated = described_crs(source.at(records[0][0]), records[0][1])
         across, up = (said.across_m or stated.across_m) / stated.across_m, (said.up_m or stated.up_m) / stated.up_m
         factors = across, across, up
+    exchanged = all(_names_exchanged(record) for _, record in records[1:])
     points: dict[str, SurveyedPoint] = {}
     marks: list[Mark] = []
     for line, record in records[1:]:
-        point, one = _row(source, line, record, factors)
+        point, one = _row(source, line, record, factors, exchanged=exchanged)
         known = points.setdefault(point.name, point)
         if any(abs(a - b) > _SAME * max(1.0, abs(a)) for a, b in zip(known.position, point.position, strict=True)):
             raise ConfigError(f"{source.at(line)}: {point.name} has other coordinates than before: one is wrong")
         points[point.name] = replace(known, check=known.check or point.check, sigmas_m=known.sigmas_m or point.sigmas_m)
         marks.append(one)
     named = [name for name in points if name.upper().startswith(_CHECK_NAME)]
-    remarks = [f"{source.path.name}: {len(named)} points are check points by their name ({_CHECK_NAME}...)"]
+    remarks = [f"{source.path.name}: {len(named)} points are check points by their name ({_CHECK_NAME}...)"] * bool(
+        named
+    )
+    if exchanged:
+        remarks.append(f"{source.path.name}: the names of image and point are exchanged: they were put right")
     return Survey(
         tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]),
-        remarks=tuple(remarks if named else ()), measured_in=source.path,
+        remarks=tuple(remarks), measured_in=source.path,
     )  # fmt: skip
 
 
@@ -78,10 +83,20 @@ def _starts_with_numbers(record: str) -> bool:
     return bool(cells) and is_number(cells[0])
 
 
-def _row(source: Source, line: int, record: str, factors: tuple[float, float, float]) -> tuple[SurveyedPoint, Mark]:
+def _names_exchanged(record: str) -> bool:
+    """Whether the name of an image stands where the point's does, and none where it should."""
+    cells = fields_of(record)[0]
+    return len(cells) > 6 and bool(IMAGE.fullmatch(cells[6])) and not IMAGE.fullmatch(cells[5])
+
+
+def _row(
+    source: Source, line: int, record: str, factors: tuple[float, float, float], *, exchanged: bool
+) -> tuple[SurveyedPoint, Mark]:
     fields, comma = fields_of(record)
     while fields and not fields[-1]:
         fields.pop()
+    if exchanged:
+        fields[5:7] = fields[6:4:-1]
     cells = with_name(fields, 5)
     if len(cells) < 6:
         raise ConfigError(f"{source.at(line)}: {len(cells)} columns, expected {_COLUMNS}")
