@@ -35,7 +35,7 @@ from aeromatch_cli.blocks.crs import (
     heights_words,
     outside_area,
 )
-from aeromatch_cli.blocks.doubles import in_two_formats
+from aeromatch_cli.blocks.doubles import in_two_formats, thumbnails
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.exif_and_xmp import settled, with_conventions
 from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
@@ -204,7 +204,8 @@ def block_inputs(
     warnings += _rasters(facts)
     facts, remarks = settled(facts)
     warnings += remarks if lists.poses == EXIF else []
-    warnings += in_two_formats({name: (fact.width_px, fact.height_px) for name, fact in facts.items()})
+    sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
+    warnings += [*in_two_formats(sizes_px), *thumbnails(sizes_px)]
     facts, remarks = with_conventions(facts)
     warnings += remarks if lists.poses == EXIF and lists.angles == "auto" else []
     observations, remarks = _observations(lists, rows, facts)

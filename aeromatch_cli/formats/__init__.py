@@ -42,7 +42,8 @@ that everything is up to date; anything else is looked into. May be deleted.
 One line per image: `image_id` (unique slug of the relative path), `name` (relative path), `width_px`, `height_px`,
 `camera_id`, `exif_orientation`, `time` (ISO 8601), `fingerprint` of the file; of its picture `blur` (0 sharp to 1: the
 share of the differences of neighbouring pixels that is left after one more blur, Crete et al. 2007; sharp pictures have
-0.15 to 0.35), `black` and `white` (shares of the pixels at either end of the scale), empty where it was not measured.
+0.15 to 0.35), `black` and `white` (shares of the pixels at either end of the scale), `damage` (what the decoder
+complains of), empty where it was not measured; `sha256` of the file, by which one that was only touched is no other.
 
 ### cameras.csv
 
@@ -299,7 +300,8 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 - `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`,
   `facts_version` (facts of another version are not read).
 - `failures`: [[item, reason], ...].
-- `facts` of pairs: `summary` (lines), `block` (figures), `warnings`, `images`, `pairs_sha256`.
+- `facts` of pairs: `summary` (lines), `block` (figures), `warnings`, `urgent` (those that --quiet does
+  not hide), `unread` (pictures of kinds that are not read, with the reason), `images`, `pairs_sha256`.
 - `facts` of enhance and extract: `images_skipped_same_illumination`. Of simulate and extract: `images`, `views`,
   `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
   `images_without_keypoints`.
