@@ -197,11 +197,14 @@ class Raster(Protocol):
 
 class PictureQuality(NamedTuple):
     """How sharp and well exposed a picture is. blur: 0 (sharp) to 1, NaN where nothing is seen. black, white: shares of
-    the pixels that show nothing."""
+    the pixels that show nothing. damage: what the decoder complains of, "" for nothing. sha256: of the
+    file, to tell one that was only touched from one that has changed."""
 
     blur: float
     black: float
     white: float
+    damage: str = ""
+    sha256: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,6 +75,12 @@ def _file_digest(path: Path) -> str:
     return digest.hexdigest()
 
 
+def contents_digest(path: Path) -> str:
+    """SHA-256 (hex) of a whole file. Raises OSError."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def image_fingerprint(path: Path) -> str:
     """Size, modification time and SHA-256 of the first and last MiB: enough to notice a changed photograph."""
     status = path.stat()

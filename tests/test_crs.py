@@ -97,6 +97,8 @@ def test_a_crs_of_another_place_is_named(crs: str, latitude: float, longitude: f
     geographic = np.array([latitude, latitude]), np.array([longitude, longitude])
     remark = outside_area(crs, np.zeros((2, 2)) if crs == "local" else grid_from_geographic(crs, *geographic))
     assert (said in remark) if said else not remark
+    # What PROJ says of the area is told in whole words.
+    assert "onshore and)" not in remark
 
 
 def test_eastings_with_the_zones_number_are_named() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGrounds, open_dem
+from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGrounds, open_dem, stated_height_m
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 
@@ -189,3 +189,68 @@ def test_of_several_rasters_the_one_that_holds_a_point_counts() -> None:
     places = [[0.0, 0.0], [1010.0, -10.0], [-40.0, 0.0], [900.0, 500.0]]
     np.testing.assert_allclose(ground.height_m(np.array(places)), [10.0, 70.0, 11.0, 71.0])
     np.testing.assert_allclose(near.distance_m(np.array([[35.0, 25.0], [38.0, 29.0], [-15.0, 0.0]])), [0.0, 5.0, 10.0])
+
+
+US_FOOT_M = 1200.0 / 3937.0
+
+
+@pytest.mark.parametrize(
+    ("crs", "units", "one_m", "said"),
+    [
+        ("EPSG:32617", "US survey foot", US_FOOT_M, "states heights in US survey foot"),
+        ("EPSG:32617", "ft", 0.3048, "states heights in ft"),
+        ("EPSG:32617", "cm", 0.01, "states heights in cm"),
+        ("EPSG:32617", "m", 1.0, ""),
+        ("EPSG:32617", "DN", 1.0, "'DN', which is no unit that is known: metres are assumed"),
+        ("EPSG:32617+6360", None, US_FOOT_M, "states heights in US survey foot"),
+        ("EPSG:32617+5703", None, 1.0, ""),
+    ],
+)
+def test_heights_of_a_dem_count_in_the_unit_that_it_states(
+    tmp_path: Path, crs: str, units: str | None, one_m: float, said: str
+) -> None:
+    import rasterio
+
+    heights = np.full((400, 400), 30.0 / one_m)
+    heights[:20] = -9999.0
+    path = write_dem(tmp_path / "dem.tif", heights, ORIGIN[0] - 1000.0, ORIGIN[1] + 1000.0, 5.0, crs)
+    if units:
+        with rasterio.open(path, "r+") as target:
+            target.units = (units,)
+    ground, notes = open_dem(path, "EPSG:32617", ORIGIN, POSITIONS)
+    np.testing.assert_allclose(ground.height_m(POSITIONS[:, :2]), [30.0, 30.0], atol=1e-4)
+    assert any(said in note for note in notes if "heights in" in note) == bool(said)
+    assert any("cells of -9999 that it does not declare" in note for note in notes)
+
+
+def test_a_dem_in_a_crs_in_feet_without_a_unit_of_heights_is_named(tmp_path: Path) -> None:
+    heights = np.full((400, 400), 30.0)
+    path = write_dem(tmp_path / "dem.tif", heights, 600_000.0, 200_000.0, 15.0, "EPSG:2264")
+    from pyproj import Transformer
+
+    x, y = Transformer.from_crs("EPSG:2264", "EPSG:32617", always_xy=True).transform(603_000.0, 197_000.0)
+    ground, notes = open_dem(path, "EPSG:32617", (x, y, 0.0), POSITIONS)
+    assert ground.height_m(np.zeros((1, 2)))[0] == pytest.approx(30.0)
+    assert any("counts in US survey foot, and nothing states the unit of its heights" in note for note in notes)
+
+
+@pytest.mark.parametrize(("land_m", "said"), [(34.0, True), (3.0, False)])
+def test_cells_of_zero_far_below_all_others_are_named(tmp_path: Path, land_m: float, said: bool) -> None:
+    heights = np.full((400, 400), land_m)
+    heights[:200] = 0.0
+    path = write_dem(tmp_path / "dem.tif", heights, ORIGIN[0] - 1000.0, ORIGIN[1] + 1000.0, 5.0)
+    _, notes = open_dem(path, "EPSG:32617", ORIGIN, POSITIONS)
+    assert any("cells of 0 (" in note and "-a_nodata 0" in note for note in notes) == said
+
+
+@pytest.mark.parametrize(("text", "z_m"), [("112 ft", 34.1376), ("34m", 34.0), ("34.5 m", 34.5), ("-3", -3.0)])
+def test_a_stated_height_may_have_a_unit(text: str, z_m: float) -> None:
+    assert stated_height_m(text) == pytest.approx(z_m)
+
+
+def test_a_stated_height_that_is_none_is_named() -> None:
+    for text in ("34,5", "112 xy", "1.2.3"):
+        with pytest.raises(ConfigError, match="is no height: give metres with a decimal point"):
+            stated_height_m(text)
+    for text in ("dem.tif", "auto", "34.tif", "3/dem.tif"):
+        assert stated_height_m(text) is None

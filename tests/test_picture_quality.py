@@ -10,6 +10,7 @@ import pytest
 from conftest import Site
 from numpy.typing import NDArray
 
+from aeromatch_cli.blocks.doubles import thumbnails
 from aeromatch_cli.blocks.left_out import excluded
 from aeromatch_cli.data import Image, PictureQuality
 from aeromatch_cli.errors import ConfigError
@@ -166,3 +167,37 @@ def test_blurred_pictures_are_named_before_the_long_stages_and_left_out_where_as
     assert f"1 of {len(names)} images ({names[3]}) are left out, as --exclude asks" in said.stderr
     assert "blurred" not in said.stderr
     assert len(read_picture_quality(site.work / "images.csv")) == len(names) - 1
+
+
+def test_a_damaged_picture_is_named_once_and_not_by_the_decoder(site: Site, capfd: pytest.CaptureFixture[str]) -> None:
+    path = site.images / site.names()[1]
+    damaged = path.with_suffix(".jpg")
+    picture = cv2.imread(str(path))
+    data = bytearray(cv2.imencode(".jpg", picture)[1].tobytes())
+    middle = len(data) // 2
+    data[middle : middle + 300] = bytes(300)
+    path.unlink()
+    damaged.write_bytes(data)
+    quality = read_quality(damaged)
+    assert quality.damage.startswith("Corrupt JPEG data")
+    assert capfd.readouterr().err == ""
+    images = [Image("a_jpg", "a.jpg", 4, 3, "1", 1)]
+    table = site.root / "images.csv"
+    table.write_text(images_text(images, {"a_jpg": "f1"}, {"a_jpg": quality}))
+    assert read_picture_quality(table)["a_jpg", "f1"].damage == quality.damage
+    outcome = site("pairs", "--set", "orient=none", "--poses", "none", "--set", "pairs=exhaustive")
+    said = [line for line in outcome.stderr.splitlines() if "Corrupt JPEG data" in line]
+    assert len(said) == 1
+    assert f"images are damaged, and a part of them may be gray or noise: {damaged.name} (Corrupt JPEG data" in said[0]
+    sound = cv2.imencode(".jpg", picture)[1].tobytes()
+    damaged.write_bytes(sound)
+    assert read_quality(damaged).damage == ""
+
+
+def test_small_copies_of_pictures_are_named() -> None:
+    sizes = {"a.jpg": (4000, 3000), "thumbs/a.jpg": (160, 120), "b.JPG": (4000, 3000), "b_thumb.jpg": (640, 480)}
+    (said,) = thumbnails(sizes)
+    assert said.startswith("2 of 4 images (thumbs/a.jpg (160 x 120), b_thumb.jpg (640 x 480)) are small copies")
+    thermal = {"DJI_1_W.JPG": (4000, 3000), "DJI_1_T.JPG": (640, 512), "x/1.jpg": (640, 512), "y/1.jpg": (4000, 3000)}
+    assert thumbnails(thermal) == []
+    assert thumbnails({"x/1.jpg": (2000, 1500), "y/1.jpg": (4000, 3000)}) == []

@@ -252,7 +252,7 @@ def test_another_crs_than_the_files_is_refused(site: Site) -> None:
 
 def test_every_format_that_content_tells_is_tried_in_the_tests() -> None:
     """Formats above by folder name, and those of tests of their own."""
-    tried = {name.split("/")[0] for name in (*WORLD, *LOCAL)} | {"micmac", "patb", "dji-mrk", "exiftool"}
+    tried = {name.split("/")[0] for name in (*WORLD, *LOCAL)} | {"micmac", "patb", "dji-mrk", "exiftool", "report"}
     assert set(POSE_FORMATS) - tried <= {"columns", "pix4d", "table", "metashape-given"}
 
 

@@ -64,7 +64,8 @@ def told(monkeypatch, parts):
 
 # Of a rendered block whose poses are off, and of one whose poses are those of the flight; one job, seconds.
 _FOUND = [
-    ("first look: extract", 3.8), ("first look: match", 0.5), ("first look: filter", 0.3),
+    ("first pass on given poses: extract", 3.8), ("first pass on given poses: match", 0.5),
+    ("first pass on given poses: filter", 0.3),
     ("first pass: extract", 8.8), ("first pass: match", 1.3), ("first pass: filter", 0.4),
     ("first pass: global mapping of 8 images", 6.0), ("pairs", 0.1),
 ]  # fmt: skip

@@ -175,9 +175,21 @@ def test_a_removed_image_leaves_the_rest_alone(done_site):
     assert left == {pair for pair in before if image_id not in pair}
 
 
-def test_a_touched_image_redoes_itself_and_its_pairs(done_site):
+def test_a_touched_image_redoes_nothing(done_site):
     before = pair_prints(done_site)
-    os.utime(done_site.image(2), (1_700_000_000, 1_700_000_000))
+    for row in range(IMAGES):
+        os.utime(done_site.image(row), (1_700_000_000, 1_700_000_000))
+    assert done_site("export", "--set", "export=geojson").code == 0
+    outcome = done_site("run")
+    assert outcome.counts("extract") == (0, IMAGES, 0)
+    assert outcome.counts("match") == (0, PAIRS, 0)
+    assert pair_prints(done_site) == before
+
+
+def test_an_edited_image_redoes_itself_and_its_pairs(done_site):
+    before = pair_prints(done_site)
+    path = done_site.image(2)
+    path.write_bytes(path.read_bytes() + b"x")
     outcome = done_site("run")
     assert outcome.counts("extract") == (1, IMAGES - 1, 0)
     assert outcome.counts("match") == (IMAGES - 1, PAIRS - IMAGES + 1, 0)

@@ -122,7 +122,7 @@ def test_a_whole_number_in_scientific_notation_gets_a_hint():
 
 def test_a_wrong_setting_is_wrong_even_where_an_option_hides_it():
     found = faults("run.jobs=-1", run={"jobs": 2})
-    assert found[0].startswith("preset baseline with --set is not valid")
+    assert found[0].startswith("wrong settings (preset baseline and --set):")
     assert found[1].startswith("  run.jobs: ")
     assert load("baseline", ["run.jobs=3"], run={"jobs": 2}).run.jobs == 2
 

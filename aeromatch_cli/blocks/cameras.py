@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
@@ -31,6 +31,8 @@ FOCAL_SIGMAS: Mapping[str, float] = {
     "35-mm equivalent of a zoomed picture": 0.4,
     "guess": 0.4,
 }
+# Focal lengths that differ by no more than this share are one, where cameras have fewer images each on average.
+_ROUNDING, _FEW_IMAGES = 0.01, 3
 # Two statements of the focal length that differ by more than this factor cannot both be meant.
 _CONTRADICTION = 1.25
 # What is shorter or longer than so many times the longer side is no focal length of a camera that takes pictures.
@@ -121,6 +123,7 @@ def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str])
     camera_ids: dict[str, str] = {}
     sources: dict[str, str] = {}
     facts, lost = _with_lost_numbers(facts, groups)
+    facts, rounded = _with_one_focal_length(facts, groups)
     for name, fact in facts.items():
         focal, sources[name] = focal_from_exif_px(fact)
         focal = round(focal, 2)
@@ -145,7 +148,7 @@ def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str])
         else ()
     )
     sigmas = {camera_ids[name]: FOCAL_SIGMAS[source] for name, source in sources.items()}
-    said = (*warnings, *lost, *_contradictions(facts), *_fisheyes(facts))
+    said = (*warnings, *lost, *rounded, *_contradictions(facts), *_fisheyes(facts))
     return CameraAssignment(cameras, camera_ids, {}, said, sigmas)
 
 
@@ -177,9 +180,35 @@ def _with_lost_numbers(
     )
 
 
+def _with_one_focal_length(
+    facts: Mapping[str, ExifFacts], groups: Mapping[str, str]
+) -> tuple[dict[str, ExifFacts], tuple[str, ...]]:
+    """Headers with the most frequent focal length in place of others that differ by rounding alone, where they would
+    make cameras of a few images each, which nothing could calibrate; and what is said of it."""
+    kinds: dict[tuple[object, ...], list[str]] = defaultdict(list)
+    for name, fact in facts.items():
+        if fact.focal_mm and fact.calibrated is None:
+            lens = fact.make, fact.model, fact.camera_serial, fact.lens, fact.band, fact.focal_35mm_mm
+            kinds[groups.get(name, ""), *lens, fact.digital_zoom, fact.width_px, fact.height_px].append(name)
+    found, said = dict(facts), list[str]()
+    for names in kinds.values():
+        lengths = Counter(mm for name in names if (mm := facts[name].focal_mm))
+        least, most = min(lengths), max(lengths)
+        if len(lengths) == 1 or most > (1.0 + _ROUNDING) * least or len(names) >= _FEW_IMAGES * len(lengths):
+            continue
+        usual_mm = lengths.most_common(1)[0][0]
+        found |= {name: replace(facts[name], focal_mm=usual_mm) for name in names}
+        said.append(
+            f"the focal lengths of {len(names)} of {len(facts)} images ({listed(names)}) differ by rounding "
+            f"({least:g} to {most:g} mm): they count as one camera with {usual_mm:g} mm"
+        )
+    return found, tuple(said)
+
+
 def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
     """A sentence where EXIF states two focal lengths of which one must be wrong, and one about digital zoom."""
     reduced, odd, zoomed = [], [], []
+    doubtful = [f"{name}: {fact.focal_doubt}" for name, fact in facts.items() if fact.focal_doubt]
     for name, fact in facts.items():
         used_px, source = focal_from_exif_px(fact)
         _, plane_px, equivalent_px = _stated_px(fact)
@@ -190,6 +219,11 @@ def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
         if source in _BY_LENS and _contradicts(used_px, equivalent_px, fact.digital_zoom):
             odd.append(f"{name}: {equivalent_px:.0f} px by 35-mm equivalent, {used_px:.0f} px by {source}")
     said = []
+    if doubtful:
+        said.append(
+            f"EXIF and XMP of {len(doubtful)} of {len(facts)} images state different focal lengths ({doubtful[0]}): "
+            "the latter is used; where the first is right give --cameras FILE"
+        )
     if reduced:
         said.append(
             f"EXIF of {len(reduced)} of {len(facts)} images states two focal lengths ({reduced[0]}): the latter is "

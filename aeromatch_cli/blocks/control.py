@@ -250,6 +250,12 @@ def _measured(
     for mark in marks:
         lines.setdefault(mark.image, mark.line)
     known, absent = matched_names(lines, list(by_name), str(path))
+    points = {mark.point: mark.line for mark in marks}
+    if marks and not known and (turned_round := matched_names(points, list(by_name), str(path))[0]):
+        raise ConfigError(
+            f"{path} names no image of the block where images are named, and images as points "
+            f"({listed(turned_round)}): exchange the columns of image and point"
+        )
     found: dict[str, dict[str, Mark]] = defaultdict(dict)
     outside, twice, turned = [], [], 0
     for mark in marks:

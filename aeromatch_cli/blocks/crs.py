@@ -27,6 +27,7 @@ _ORIGIN_STEP_M = 1000.0
 _MARGIN_DEG = 3.0
 # Eastings of some CRSs and many lists begin with the number of the zone, in millions.
 _PREFIX_M = 1_000_000.0
+_LONGEST_AREA = 160  # characters of what is said of the area of a CRS
 _SAME_M = 0.001
 # What heights count from where no vertical CRS does.
 ELLIPSOID = "ellipsoid"
@@ -283,6 +284,12 @@ def geographic_from_grid(crs: str, xy_m: FloatArray) -> FloatArray:
     return np.column_stack([latitudes, longitudes])
 
 
+def _first_sentence(text: str) -> str:
+    """Of PROJ's words on an area, cut between words where it is very long."""
+    first = re.split(r"\.(?:\s|$)", text, maxsplit=1)[0]
+    return first if len(first) <= _LONGEST_AREA else first[:_LONGEST_AREA].rpartition(" ")[0] + " ..."
+
+
 def outside_area(crs: str, xy_m: FloatArray) -> str:
     """What is odd about coordinates (N, 2) in a CRS, for a person: the block lies far from where the CRS is used, or
     eastings begin with the number of the zone; "" where nothing is, and in a local frame."""
@@ -307,7 +314,7 @@ def outside_area(crs: str, xy_m: FloatArray) -> str:
         return ""
     return (
         f"the block lies at latitude {latitude:.2f}, longitude {longitude:.2f}, far outside {crs} ({known.name}, "
-        f"{area.name.rstrip('.')[:80]}): is it the right CRS?"
+        f"{_first_sentence(area.name)}): is it the right CRS?"
     )
 
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import filecmp
+import re
 from collections import defaultdict
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.other_files import twins
 
 # Files of equal size differ in their first or last bytes, or nowhere: these many are compared before whole ones.
 _EDGE_BYTES = 65_536
+# What is added to the names of small copies; how much smaller than others they are, and how far their shape is rounded.
+_SMALL_NAME = re.compile(r"^(thumb|thumbnail|preview|tn|small)[_-]|[_-](thumb|thumbnail|preview|tn|small)$")
+_SMALLER, _ROUNDED_PX = 3, 2
 
 
 def doubles(files: Mapping[str, Path]) -> dict[str, str]:
@@ -54,6 +58,27 @@ def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
         return []
     shown = listed([" and ".join(same) for same in pairs])
     return [f"{len(pairs)} pictures are there in two formats ({shown}): remove one of each"]
+
+
+def thumbnails(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
+    """What is said of small pictures that have the name and the shape of large ones. sizes_px: of every picture."""
+    by_name: dict[str, list[str]] = defaultdict(list)
+    for name in sizes_px:
+        by_name[_SMALL_NAME.sub("", PurePosixPath(name).stem.lower())].append(name)
+    small = []
+    for names in by_name.values():
+        width_px, height_px = max((sizes_px[name] for name in names), key=max)
+        for name in names:
+            own = sizes_px[name]
+            alike = abs(own[0] * height_px - own[1] * width_px) <= _ROUNDED_PX * max(width_px, height_px)
+            if alike and _SMALLER * max(own) <= max(width_px, height_px):
+                small.append(f"{name} ({own[0]} x {own[1]})")
+    if not small:
+        return []
+    return [
+        f"{len(small)} of {len(sizes_px)} images ({listed(small)}) are small copies of others, such as thumbnails: "
+        "--exclude leaves them out"
+    ]
 
 
 def _edges(path: Path, size: int) -> bytes:

@@ -21,9 +21,12 @@ from aeromatch_cli.blocks.maker_notes import dji_camera_angles
 from aeromatch_cli.blocks.packets import Packets, jp2_packets, jpeg_packets, png_packets
 from aeromatch_cli.blocks.xmp import (
     CameraAngles,
+    has_signs,
     tag_number,
+    unread_numbers,
     xmp_angles,
     xmp_band,
+    xmp_metres,
     xmp_panel,
     xmp_position,
     xmp_properties,
@@ -66,6 +69,11 @@ _HEIC_CONTENT = {
 }
 # Positions nearer to (0, 0) stand for none; altitudes that are higher are overflown numbers.
 _NO_FIX_DEG, _HIGHEST_M, _ALTITUDE_ROUNDING_M = 1e-7, 30_000.0, 2.0
+# Of one place stated twice, and of two on either side of the equator or of Greenwich.
+_SAME_PLACE_DEG, _MIRRORED_DEG = 1e-4, 0.01
+# 35-mm equivalents are so many times the focal length, from medium format to the smallest sensors of telephones; two
+# statements of one length differ by less than this factor.
+_CROP_FACTORS, _SAME_LENGTH = (0.4, 15.0), 1.25
 _TAKEN_NORTH_EAST = ": it counts as north and east; where that is wrong, write the letters (exiftool) or give --poses"
 # What Pillow raises on headers that are cut or scrambled.
 _BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, struct.error)
@@ -76,7 +84,8 @@ class ExifFacts:
     """The header of one image; None or "" where a fact is absent or unusable.
 
     width_px, height_px: the stored raster, whatever `orientation` (1-8) says. focal_35mm_mm: 35-mm equivalent.
-    digital_zoom: how many times a part of the sensor was enlarged. focal_plane_px_per_mm: horizontal, for the stored
+    focal_doubt: what XMP states otherwise of these two, in words, the one that counts last. digital_zoom: how many
+    times a part of the sensor was enlarged. focal_plane_px_per_mm: horizontal, for the stored
     raster; focal_plane_confirmed: EXIF names the raster that the tag speaks of, so that resizing is allowed for. time:
     ISO text with fraction of a second. latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file
     states it, whatever its datum. xmp_position: the same three as XMP states them. relative_altitude_m: above the
@@ -96,6 +105,7 @@ class ExifFacts:
     model: str = ""
     focal_mm: float | None = None
     focal_35mm_mm: float | None = None
+    focal_doubt: str = ""
     digital_zoom: float = 1.0
     focal_plane_px_per_mm: float | None = None
     focal_plane_confirmed: bool = False
@@ -151,7 +161,9 @@ def read_exif(path: Path) -> ExifFacts:
         angles = xmp_angles(dji_camera_angles(exif.get(_MAKER_NOTE)))
         notes += ["no angles in XMP: those of DJI's maker notes are used"] if angles is not None else []
     in_xmp = xmp_position(xmp)
-    latitude_deg, longitude_deg, altitude_m = _position(header.gps, in_xmp, notes)
+    notes += unread_numbers(xmp)
+    latitude_deg, longitude_deg, altitude_m = _position(header.gps, in_xmp, has_signs(xmp), notes)
+    focal_mm, focal_35mm_mm, doubt = _focal_lengths(exif, xmp)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
     # 0 says that there is none; pictures are enlarged by it and not reduced.
     zoom = max(_positive(exif.get(_DIGITAL_ZOOM)) or _positive(xmp.get("exif:DigitalZoomRatio")) or 1.0, 1.0)
@@ -163,8 +175,9 @@ def read_exif(path: Path) -> ExifFacts:
         orientation=int(orientation) if 1 <= orientation <= 8 else 1,
         make=_text(tags.get(_MAKE)) or xmp.get("tiff:Make", ""),
         model=_text(tags.get(_MODEL)) or xmp.get("tiff:Model", ""),
-        focal_mm=_positive(exif.get(_FOCAL_LENGTH)) or _positive(xmp.get("exif:FocalLength")),
-        focal_35mm_mm=_positive(exif.get(_FOCAL_LENGTH_35MM)) or _positive(xmp.get("exif:FocalLengthIn35mmFilm")),
+        focal_mm=focal_mm,
+        focal_35mm_mm=focal_35mm_mm,
+        focal_doubt=doubt,
         digital_zoom=zoom,
         focal_plane_px_per_mm=focal_plane,
         focal_plane_confirmed=confirmed,
@@ -173,7 +186,7 @@ def read_exif(path: Path) -> ExifFacts:
         longitude_deg=longitude_deg,
         altitude_m=altitude_m,
         xmp_position=in_xmp,
-        relative_altitude_m=tag_number(xmp.get("drone-dji:RelativeAltitude")),
+        relative_altitude_m=xmp_metres(xmp, "drone-dji:RelativeAltitude"),
         angles=angles,
         calibrated=calibrated_camera(xmp, width_px, height_px) if zoom == 1.0 else None,
         sigmas_m=_sigmas_m(header.gps, xmp, notes),
@@ -303,15 +316,29 @@ def _tables_of(packets: Packets, notes: list[str]) -> list[Mapping[int, Any]]:
 
 
 def _position(
-    gps: Mapping[int, Any], in_xmp: tuple[float | None, float | None, float | None], notes: list[str]
+    gps: Mapping[int, Any], in_xmp: tuple[float | None, float | None, float | None], signed: bool, notes: list[str]
 ) -> tuple[float | None, float | None, float | None]:
-    """Latitude, longitude and altitude: of EXIF, else of XMP."""
+    """Latitude, longitude and altitude: of EXIF, else of XMP, or where these differ by the hemisphere alone and XMP
+    states it. signed: whether it does."""
     latitude, longitude = _exif_position(gps, in_xmp, notes)
+    if signed and latitude is not None and longitude is not None and _mirrored((latitude, longitude), in_xmp[:2]):
+        notes.append(
+            "the hemisphere of the GPS position (GPSLatitudeRef, GPSLongitudeRef) is not that of XMP: that of XMP is "
+            "used"
+        )
+        latitude = longitude = None
     if latitude is None or longitude is None:
         latitude, longitude = in_xmp[:2]
     if latitude is None or longitude is None:
         return None, None, None
     return latitude, longitude, _altitude(gps, in_xmp[2], notes)
+
+
+def _mirrored(own: tuple[float, float], others: tuple[float | None, float | None]) -> bool:
+    """Whether two positions are the same but for signs."""
+    pairs = [(a, b) for a, b in zip(own, others, strict=True) if b is not None]
+    alike = all(abs(abs(a) - abs(b)) < _SAME_PLACE_DEG for a, b in pairs)
+    return len(pairs) == 2 and alike and any(abs(a - b) > _MIRRORED_DEG for a, b in pairs)
 
 
 def _exif_position(
@@ -381,6 +408,30 @@ def _sexagesimal(value: Any, reference: str, letters: str, largest: float) -> fl
             return None
         total += number / scale
     return sign * total if total <= largest else None
+
+
+def _focal_lengths(exif: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float | None, float | None, str]:
+    """Focal length and its 35-mm equivalent: of EXIF, else of XMP; where these state different ones, that which goes
+    with the other of the two. And both in words, where they do."""
+    stated = [
+        [_positive(exif.get(tag)), _positive(xmp.get(name))]
+        for tag, name in ((_FOCAL_LENGTH, "exif:FocalLength"), (_FOCAL_LENGTH_35MM, "exif:FocalLengthIn35mmFilm"))
+    ]
+    lengths, equivalents = ([one for one in dict.fromkeys(both) if one or not any(both)] for both in stated)
+    fits = (
+        (own, equivalent)
+        for own in lengths
+        for equivalent in equivalents
+        if not (own and equivalent) or _CROP_FACTORS[0] < equivalent / own < _CROP_FACTORS[1]
+    )
+    used = next(fits, (lengths[0], equivalents[0]))
+    doubts = []
+    for what, (by_exif, by_xmp), one in zip(("focal length", "35-mm equivalent"), stated, used, strict=True):
+        if by_exif and by_xmp and not 1.0 / _SAME_LENGTH < by_exif / by_xmp < _SAME_LENGTH:
+            places = {"EXIF": by_exif, "XMP": by_xmp}
+            shown = sorted(places.items(), key=lambda place: place[1] == one)
+            doubts.append(f"{what} " + ", ".join(f"{mm:g} mm in {place}" for place, mm in shown))
+    return used[0], used[1], "; ".join(doubts)
 
 
 def _focal_plane(exif: Mapping[int, Any], width_px: int, height_px: int) -> tuple[float | None, bool]:

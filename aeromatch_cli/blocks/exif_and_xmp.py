@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from aeromatch_cli.blocks.altitudes import consistent_altitudes
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.xmp import from_level
 from aeromatch_cli.data import BoolArray, FloatArray
@@ -25,8 +26,6 @@ _ALIKE_M = 3.0
 _COARSE = 0.5
 # A single position is elsewhere beyond so many times the extent of the others, and so many metres.
 _ELSEWHERE, _ELSEWHERE_M = 2.0, 200.0
-# A height of exactly 0 in so many images, and in all, is none.
-_LEAST_IMAGES = 3
 _NAMES = 5
 
 
@@ -43,6 +42,8 @@ def settled(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[
         for name, (latitude, longitude) in zip(both, xmp_deg, strict=True):
             if name in taken:
                 found[name] = replace(found[name], latitude_deg=float(latitude), longitude_deg=float(longitude))
+    found, said = consistent_altitudes(found)
+    remarks += said
     both = [n for n, fact in found.items() if fact.altitude_m is not None and fact.xmp_position[2] is not None]
     if both:
         exif_m = np.array([[found[name].altitude_m] for name in both], dtype=float)
@@ -50,8 +51,7 @@ def settled(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[
         taken, remark = _sounder("heights", both, exif_m, xmp_m)
         remarks += remark
         found |= {name: replace(found[name], altitude_m=found[name].xmp_position[2]) for name in taken}
-    heights, remark = _without_zeros(found)
-    return found | heights, remarks + remark
+    return found, remarks
 
 
 def with_conventions(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
@@ -74,22 +74,6 @@ def with_conventions(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFact
             "down; --set block.angles=nadir reads it by its tag"
         )
     return found, remarks
-
-
-def _without_zeros(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
-    """Headers of a block in which no height is stated, or 0 for all images: with heights above the take-off point,
-    where all have them, else without."""
-    placed = {name: fact for name, fact in facts.items() if fact.latitude_deg is not None}
-    if len(placed) < _LEAST_IMAGES or any(fact.altitude_m for fact in placed.values()):
-        return {}, []
-    zeros = [name for name, fact in placed.items() if fact.altitude_m == 0.0]
-    said = f"GPSAltitude is 0 in {len(zeros)} of {len(facts)} images" if zeros else "no image states an altitude"
-    if any(fact.relative_altitude_m for fact in placed.values()) and all(
-        fact.relative_altitude_m is not None for fact in placed.values()
-    ):
-        above = {name: replace(fact, altitude_m=fact.relative_altitude_m) for name, fact in placed.items()}
-        return above, [f"{said}: heights above the take-off point (RelativeAltitude) are used"]
-    return {name: replace(placed[name], altitude_m=None) for name in zeros}, [f"{said}: not used"] if zeros else []
 
 
 def _sounder(what: str, names: Sequence[str], exif_m: FloatArray, xmp_m: FloatArray) -> tuple[set[str], list[str]]:

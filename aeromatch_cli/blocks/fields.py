@@ -7,7 +7,9 @@ import re
 from collections.abc import Sequence
 
 # A name that is an image's.
-IMAGE = re.compile(r".+\.(jpe?g|tiff?|jp2|j2k|png|hei[cf]|dng|raw|arw|cr[23]|nef|raf|rw2|orf|iiq|gpr)", re.IGNORECASE)
+IMAGE = re.compile(
+    r".+\.(jpe?g|jpe|jfif|tiff?|jp2|j2k|png|hei[cf]|dng|raw|arw|cr[23]|nef|raf|rw2|orf|iiq|gpr)", re.IGNORECASE
+)
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
 _DECIMAL = re.compile(r"[-+]?\d+,\d+")
 

@@ -5,13 +5,15 @@ All heights of a ground are world heights: those of the block's CRS minus the wo
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.crs import LOCAL, converted_heights, heights_of, heights_words
+from aeromatch_cli.blocks.crs import LOCAL, across_unit_m, converted_heights, heights_of, heights_words, parsed_crs
+from aeromatch_cli.blocks.units import metres_of
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import check_given
@@ -26,7 +28,13 @@ _MARGIN_M = (100.0, 20_000.0)
 # A height beyond these is none on land: -9999, -32768, 3.4e38 stand for no data, declared or not. So does 0 where all
 # other heights are higher than a cliff.
 _LOWEST_M, _HIGHEST_M, _ABOVE_ZERO_M = -500.0, 9000.0, 100.0
+# Where all others are higher than this, 0 may be the sea or no data.
+_SAID_ABOVE_ZERO_M = 5.0
+# Of these also where one unit is so small that they could be heights.
+_CODES = (-9999.0, -32767.0, -32768.0)
 _CODES_NAMED = 3
+# A number and a word behind it.
+_HEIGHT = re.compile(r"[-+]?(?:\d[\d.,]*)?\d\s*(?:[^\W\d]+[\s-]?){0,3}")
 # The geoid is asked for at no more places a side.
 _SHIFT_PLACES = 33
 # So many cells more than asked for, half of them for interpolation.
@@ -100,12 +108,32 @@ class SeveralGrounds:
         return np.asarray(heights[nearest, np.arange(len(points))])
 
 
+def looks_like_height(text: str) -> bool:
+    """Whether a ground is a number, with a unit or without, and no name of a file."""
+    return metres_of(text) is not None or bool(_HEIGHT.fullmatch(text.strip()))
+
+
+def stated_height_m(text: str) -> float | None:
+    """A height with its unit, metres without one; None of what names a file. Raises ConfigError for a number that is
+    neither."""
+    if not looks_like_height(text):
+        return None
+    found = metres_of(text) if "," not in text else None
+    if found is None:
+        raise ConfigError(
+            f"--ground {text!r} is no height: give metres with a decimal point, such as 34.5, or with a unit, such as "
+            "'112 ft'; or a DEM, or auto"
+        )
+    return found
+
+
 def open_dem(
     path: Path, crs: str, origin_m: tuple[float, float, float], positions_m: FloatArray, zero: str = ""
 ) -> tuple[DemGround, tuple[str, ...]]:
     """The DEM under a block, resampled bilinearly into the block's CRS, and what the user should know about it.
 
-    path: any single-band raster of heights in metres that GDAL reads (the first band counts). crs: authority code of
+    path: any single-band raster of heights that GDAL reads (the first band counts), in the unit that the band or the
+    vertical axis of its CRS states, else in metres. crs: authority code of
     the world frame or "local"; origin_m: the world origin in it; positions_m: (N, 3) projection centres in the world
     frame. Only the block's extent, 5 flying heights around the cameras, is read. Cells without data get the median.
     zero: what heights of the world count from, as of `crs.heights_of`: those of a DEM that states another zero are
@@ -123,15 +151,17 @@ def open_dem(
         check_given(path)
         with rasterio.open(path) as dataset:
             source_crs, notes = _source_crs(dataset, path, crs)
+            unit_m, of_unit = _unit_m(dataset, path)
+            notes += of_unit
             absolute = np.asarray(positions_m, dtype=np.float64) + np.asarray(origin_m)
             low, high = absolute[:, :2].min(axis=0), absolute[:, :2].max(axis=0)
             frames = (source_crs, source_crs if crs == "local" else rasterio.CRS.from_user_input(crs))
-            coarse, _, _ = _read_extent(dataset, frames, low - _MARGIN_M[0], high + _MARGIN_M[0], 512)
+            coarse, _, _ = _read_extent(dataset, frames, low - _MARGIN_M[0], high + _MARGIN_M[0], 512, unit_m)
             if not np.isfinite(coarse).any():
                 raise ConfigError(f"the DEM {path} does not cover the block {_extent_text(low, high, crs)}")
             reach = MAX_DISTANCE_FACTOR * float(absolute[:, 2].max() - np.nanmin(coarse))
             margin = float(np.clip(reach, *_MARGIN_M))
-            heights, transform, codes = _read_extent(dataset, frames, low - margin, high + margin, _MAX_CELLS)
+            heights, transform, codes = _read_extent(dataset, frames, low - margin, high + margin, _MAX_CELLS, unit_m)
     except (RasterioError, OSError) as error:
         said = getattr(error, "strerror", None) or error
         raise ConfigError(f"cannot read the DEM {path}: {said}; give a GeoTIFF of heights or a constant") from error
@@ -145,6 +175,7 @@ def open_dem(
         )
     known = np.isfinite(heights)
     median = float(np.median(heights[known]))
+    notes += _of_zeros(heights[known], path)
     if not known.all():
         share = 100.0 * float(1.0 - known.mean())
         missing = f"{share:.0f}" if share < 99.0 else "more than 99"
@@ -209,13 +240,49 @@ def _source_crs(dataset: DatasetReader, path: Path, crs: str) -> tuple[Any, tupl
     return dataset.crs, ()
 
 
+def _unit_m(dataset: DatasetReader, path: Path) -> tuple[float, tuple[str, ...]]:
+    """Metres of one unit of heights, as the band or the vertical axis of the CRS states it, and a note where that is
+    not metres, or is not stated in a CRS that counts in feet."""
+    text = (dataset.units[0] or "").strip()
+    crs = parsed_crs(dataset.crs.to_wkt()) if dataset.crs is not None else None
+    vertical = next((axis for axis in crs.axis_info if axis.direction.lower() == "up"), None) if crs else None
+    unit_m = metres_of(f"1 {text}") if text else None
+    if unit_m is None and vertical is not None:
+        text, unit_m = vertical.unit_name, float(vertical.unit_conversion_factor)
+    if unit_m is not None:
+        stated = unit_m != 1.0
+        return unit_m, (f"the DEM {path} states heights in {text}: they are converted to metres",) if stated else ()
+    if text:
+        return 1.0, (
+            f"the DEM {path} states heights in {text[:30]!r}, which is no unit that is known: metres are assumed",
+        )
+    if crs is not None and across_unit_m(crs) != 1.0:
+        name = crs.axis_info[0].unit_name
+        return 1.0, (f"the CRS of the DEM {path} counts in {name}, and nothing states the unit of its heights: metres "
+                     "are assumed; where they are not, give the DEM a compound CRS",)  # fmt: skip
+    return 1.0, ()
+
+
+def _of_zeros(heights_m: FloatArray, path: Path) -> tuple[str, ...]:
+    """A note on heights of exactly 0 that are far below all others."""
+    rest = heights_m[heights_m != 0.0]
+    if rest.size in (0, heights_m.size) or rest.min() <= _SAID_ABOVE_ZERO_M:
+        return ()
+    share = 100.0 * (1.0 - rest.size / heights_m.size)
+    return (
+        f"the DEM {path} has cells of 0 ({share:.0f} % around the block), and all others are {rest.min():.0f} m or "
+        f"higher: if they stand for no data and not for the sea, declare them as such (gdal_edit.py -a_nodata 0)",
+    )
+
+
 def _read_extent(
-    dataset: DatasetReader, frames: tuple[Any, Any], low: FloatArray, high: FloatArray, max_cells: int
+    dataset: DatasetReader, frames: tuple[Any, Any], low: FloatArray, high: FloatArray, max_cells: int, unit_m: float
 ) -> tuple[FloatArray, Any, list[float]]:
     """Heights (H, W) float64, NaN without data, over a box of the second frame's CRS, their affine transform, and what
     stands for no data without being declared.
 
-    frames: CRS of the DEM and of the block. Cells are as fine as the DEM's; within one CRS they are its own.
+    frames: CRS of the DEM and of the block. unit_m: metres of one unit of its heights. Cells are as fine as
+    the DEM's; within one CRS they are its own.
     """
     import rasterio
     from rasterio.warp import Resampling, reproject, transform_bounds
@@ -237,7 +304,7 @@ def _read_extent(
     stored, stored_transform = _stored_part(dataset, (left, bottom, right, top), max_cells + _BESIDE)
     if stored.size == 0:
         return heights, transform, []
-    stored, codes = _without_voids(stored)
+    stored, codes = _without_voids(stored, unit_m)
     reproject(
         stored,
         heights,
@@ -279,14 +346,15 @@ def _stored_part(
     return heights, rasterio.Affine(*(place_from_cell @ cell_from_part)[:2].ravel())
 
 
-def _without_voids(heights: FloatArray) -> tuple[FloatArray, list[float]]:
-    """Heights with NaN for what can be none, and the values that were taken out."""
+def _without_voids(heights: FloatArray, unit_m: float) -> tuple[FloatArray, list[float]]:
+    """Heights in metres with NaN for what can be none, and the values that were taken out, as they are stored."""
+    heights_m = unit_m * heights
     with np.errstate(invalid="ignore"):
-        void = (heights < _LOWEST_M) | (heights > _HIGHEST_M)
-        rest = heights[~void & np.isfinite(heights) & (heights != 0.0)]
+        void = (heights_m < _LOWEST_M) | (heights_m > _HIGHEST_M) | np.isin(heights, _CODES)
+        rest = heights_m[~void & np.isfinite(heights_m) & (heights_m != 0.0)]
         if rest.size and rest.min() > _ABOVE_ZERO_M:
-            void |= heights == 0.0
-    return np.where(void, np.nan, heights), np.unique(heights[void]).tolist()
+            void |= heights_m == 0.0
+    return np.where(void, np.nan, heights_m), np.unique(heights[void]).tolist()
 
 
 def _extent_text(low: FloatArray, high: FloatArray, crs: str) -> str:

@@ -8,9 +8,10 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from aeromatch_cli.images import heif
+from aeromatch_cli.images.files import JPEG_SUFFIXES
 from aeromatch_cli.images.masks import compresses_like_a_mask, is_black_and_white
 
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k", *JPEG_SUFFIXES[2:])
 KINDS = ", ".join(suffix[1:] for suffix in _SUFFIXES)  # as messages say it
 MASK = "masks of images, not images: give the folder with --masks to use them"
 
@@ -21,9 +22,21 @@ _MASK_FOLDERS = ("mask", "masks")
 _LOSSLESS, _DECODED = ".png", 3
 _RAW = (
     *(".dng", ".arw", ".cr2", ".cr3", ".nef", ".nrw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".iiq", ".3fr", ".fff"),
-    *(".raw", ".gpr", ".rwl", ".x3f", ".erf", ".kdc", ".mrw"),
+    *(".raw", ".gpr", ".rwl", ".x3f", ".erf", ".kdc", ".mrw", ".sr2", ".srf", ".crw", ".dcr", ".mef", ".mos", ".ptx"),
 )
-_OTHER_PICTURES = (".avif", ".webp", ".jxl", ".bmp", ".gif")
+_OTHER_PICTURES = (
+    *(".avif", ".webp", ".jxl", ".bmp", ".dib", ".gif", ".mpo", ".jpf", ".jpx", ".jxr", ".psd", ".psb", ".tga", ".exr"),
+    *(".ppm", ".pgm", ".pnm", ".ecw", ".sid", ".rjpg"),
+)
+# What files begin with whose suffix is not known.
+_CONTENTS = {
+    b"\xff\xd8\xff": "a JPEG by its content: rename it to .jpg",
+    b"\x89PNG\r\n": "a PNG by its content: rename it to .png",
+    b"II*\0": "TIFF or raw by its content: rename it to .tif, or develop it",
+    b"MM\0*": "TIFF or raw by its content: rename it to .tif, or develop it",
+}
+# By-products that hold a picture: thumbnails of videos, and what programs and downloads leave.
+_BY_PRODUCTS = (".thm", ".lrv", ".bak", ".tmp", ".part", ".crdownload")
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".insv", ".lrv")
 
 
@@ -76,6 +89,13 @@ def masks_by_content(folder: Path, names: Iterable[str]) -> set[str]:
 
 def unread_kind(name: str) -> str:
     """What a file is that shows something and is not read, with the remedy; "" for any other file."""
+    if PurePosixPath(name).suffix.lower() in _VIDEOS:
+        return "videos are not read: `aeromatch frames VIDEO --out DIR` writes pictures of one, and their positions"
+    return unread_picture(name)
+
+
+def unread_picture(name: str) -> str:
+    """The same of pictures alone, by their suffix."""
     suffix = PurePosixPath(name).suffix.lower()
     if suffix in _RAW:
         return "raw pictures are not read: develop them to JPEG or TIFF in full size, without correction of the lens"
@@ -86,9 +106,20 @@ def unread_kind(name: str) -> str:
         )
     if suffix in _OTHER_PICTURES:
         return f"{suffix[1:].upper()} is not read: convert to JPEG or TIFF in full size, with the metadata"
-    if suffix in _VIDEOS:
-        return "videos are not read: `aeromatch frames VIDEO --out DIR` writes pictures of one, and their positions"
     return ""
+
+
+def unread_content(path: Path) -> str:
+    """The same of a file whose suffix says nothing, by what it begins with."""
+    suffix = path.suffix.lower()
+    if suffix in _BY_PRODUCTS or suffix in _VIDEOS:
+        return ""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(8)
+    except OSError:
+        return ""
+    return next((words for begins, words in _CONTENTS.items() if head.startswith(begins)), "")
 
 
 def _keys(file: str) -> set[str]:

@@ -35,7 +35,7 @@ from aeromatch_cli.blocks.crs import (
     heights_words,
     outside_area,
 )
-from aeromatch_cli.blocks.doubles import in_two_formats
+from aeromatch_cli.blocks.doubles import in_two_formats, thumbnails
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.exif_and_xmp import settled, with_conventions
 from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
@@ -77,7 +77,8 @@ class BlockInputs:
     images without position are absent. angles: image_id -> attitude as it was given. ground_hint_z_m: world height of
     the ground as the input states it, or None; ground_hint_source: where it came from, in words, "" for None;
     ground_is_stated: the user's camera file says so, rather than a barometer. focal_sigmas: camera id -> standard
-    deviation of its focal length, as a share of it. warnings: for a person, in order of reading.
+    deviation of its focal length, as a share of it. warnings: for a person, in order of reading. unread: pictures of
+    kinds that are not read, and panoramas.
     recognised: what the pose file was read as, and how many images it has, "" without one. flights, velocities: as in
     `sorties`. heights: what those of the world count from, as of `crs.heights_of`, "" where nothing states it.
     """
@@ -95,6 +96,7 @@ class BlockInputs:
     likely_focals: Mapping[str, float]
     warnings: tuple[str, ...]
     failures: tuple[ReadFailure, ...]
+    unread: tuple[ReadFailure, ...] = ()
     recognised: str = ""
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -172,12 +174,16 @@ def block_inputs(
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
+    out, remarks = excluded(exclude, [*headers, *(one.name for one in passed_over if one.unread)])
+    passed_over = [one for one in passed_over if one.name not in out]
+    unread = tuple(ReadFailure(one.name, one.reason) for one in passed_over if one.unread)
     warnings, failures = _report_scan(passed_over)
-    out, remarks = excluded(exclude, list(headers))
     warnings += remarks
     failures += [ReadFailure(name, why) for name, why in headers.items() if isinstance(why, str) and name not in out]
     facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str) and name not in out}
-    warnings += _panoramas(facts)
+    panoramas, said = _panoramas(facts)
+    unread += panoramas
+    warnings += said
     facts = {name: fact for name, fact in facts.items() if not fact.panorama}
     shots = ground_shots(facts)
     warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
@@ -198,7 +204,8 @@ def block_inputs(
     warnings += _rasters(facts)
     facts, remarks = settled(facts)
     warnings += remarks if lists.poses == EXIF else []
-    warnings += in_two_formats({name: (fact.width_px, fact.height_px) for name, fact in facts.items()})
+    sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
+    warnings += [*in_two_formats(sizes_px), *thumbnails(sizes_px)]
     facts, remarks = with_conventions(facts)
     warnings += remarks if lists.poses == EXIF and lists.angles == "auto" else []
     observations, remarks = _observations(lists, rows, facts)
@@ -237,6 +244,7 @@ def block_inputs(
         likely_focals=likely_focals,
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
+        unread=unread,
         recognised=_recognised(lists, rows, headers, assignment.by_pose_file),
         flights=flight_of,
         velocities=velocities(captures, flight_of),
@@ -331,12 +339,13 @@ def _cameras_of_poses(
     )
 
 
-def _panoramas(facts: Mapping[str, ExifFacts]) -> list[str]:
-    """What is said of panoramas, which are left out."""
+def _panoramas(facts: Mapping[str, ExifFacts]) -> tuple[tuple[ReadFailure, ...], list[str]]:
+    """Panoramas, which are left out, and what is said of them."""
     names = [name for name, fact in facts.items() if fact.panorama]
     kinds = ", ".join(sorted({fact.panorama[:30] for fact in facts.values() if fact.panorama}))
     what = f"panoramas by their XMP ({kinds}), no pictures of one lens: give the pictures that they were made of"
-    return [f"passed over {len(names)}: {listed(names)}: {what}"] if names else []
+    said = [f"passed over {len(names)}: {listed(names)}: {what}"] if names else []
+    return tuple(ReadFailure(name, what) for name in names), said
 
 
 def _rasters(facts: Mapping[str, ExifFacts]) -> list[str]:

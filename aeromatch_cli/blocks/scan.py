@@ -9,7 +9,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from aeromatch_cli.blocks.other_files import MASK, image_suffixes, masks_among, masks_by_content, unread_kind
+from aeromatch_cli.blocks.other_files import (
+    MASK,
+    image_suffixes,
+    masks_among,
+    masks_by_content,
+    unread_content,
+    unread_kind,
+    unread_picture,
+)
 from aeromatch_cli.errors import ConfigError
 
 _FOLDER_MARK = "--"
@@ -30,12 +38,14 @@ class ScanFailure:
     """Something that has the name of an image and is none.
 
     name: path relative to the images folder. reason: in words. image_lost: True where a picture is probably missing
-    from the block (empty file, broken link, unreadable folder), False for by-products such as `._x.jpg`.
+    from the block (empty file, broken link, unreadable folder), False for by-products such as `._x.jpg`. unread: a
+    picture of a kind that is not read.
     """
 
     name: str
     reason: str
     image_lost: bool
+    unread: bool = False
 
 
 def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], list[ScanFailure]]:
@@ -80,7 +90,7 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
             path = Path(parent) / name
             relative = path.relative_to(folder).as_posix()
             if Path(name).suffix.lower() not in suffixes:
-                failures += _unread(relative)
+                failures += _unread(relative, path)
                 continue
             if files_passed_over and os.path.realpath(path) in files_passed_over:
                 continue
@@ -127,17 +137,24 @@ def _sorted_out(names: list[str], failures: list[ScanFailure]) -> tuple[list[str
     kept = sorted(name for name in names if name not in masks)
     twins = {str(Path(name).with_suffix("")).lower() for name in kept}
     failures = [
-        one for one in failures if not (unread_kind(one.name) and str(Path(one.name).with_suffix("")).lower() in twins)
+        one
+        for one in failures
+        if not ((one.unread or unread_kind(one.name)) and str(Path(one.name).with_suffix("")).lower() in twins)
     ]
     failures += [ScanFailure(name, MASK, False) for name in masks]
     return kept, sorted(failures, key=lambda failure: failure.name)
 
 
-def _unread(name: str) -> list[ScanFailure]:
-    """What is said of a file that has another suffix than images."""
-    hidden = any(part.startswith(".") for part in name.split("/"))
-    reason = "" if hidden or _CONTROL.search(name) else unread_kind(name)
-    return [ScanFailure(name, reason, False)] if reason else []
+def _unread(name: str, path: Path | None = None) -> list[ScanFailure]:
+    """What is said of a file that has another suffix than images. path: of it, where it is on this machine."""
+    if any(part.startswith(".") for part in name.split("/")) or _CONTROL.search(name):
+        return []
+    if reason := unread_picture(name):
+        return [ScanFailure(name, reason, False, unread=True)]
+    if reason := unread_kind(name):
+        return [ScanFailure(name, reason, False)]
+    reason = unread_content(path) if path is not None and path.is_file() else ""
+    return [ScanFailure(name, reason, False, unread=True)] if reason else []
 
 
 def _unfit(name: str) -> ScanFailure | None:

@@ -19,6 +19,8 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+from aeromatch_cli.blocks.units import metres_of
+
 _LATITUDES = ("drone-dji:GpsLatitude", "drone-dji:Latitude", "drone-skydio:Latitude", "exif:GPSLatitude")
 # DJI's firmware spelt the tag "GpsLongtitude" for years.
 _LONGITUDES = (
@@ -54,6 +56,8 @@ _ANGLES = (
 _WIDE = {
     b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"<\0": "utf-16-le", b"\0<": "utf-16-be",
 }  # fmt: skip
+# A letter of the hemisphere before or behind a number of degrees.
+_LETTERED = re.compile(r"([NSEW]?)\s*(\d+(?:\.\d+)?)\s*°?\s*([NSEW]?)")
 _ADOBE_DEGREES = re.compile(r"(\d+),(\d+(?:\.\d+)?)(?:,(\d+(?:\.\d+)?))?([NSEW])")
 _LARGEST_ANGLE_DEG = 360.0
 # A camera that looks further back than this from straight down.
@@ -187,17 +191,42 @@ def _prefix(namespace: str, local: str) -> str:
 def xmp_position(xmp: Mapping[str, str]) -> tuple[float | None, float | None, float | None]:
     """Latitude and longitude, both or neither, and altitude. A position of (0, 0) is none."""
     latitude, longitude = _first_degrees(xmp, _LATITUDES, 90.0), _first_degrees(xmp, _LONGITUDES, 180.0)
-    altitude = next((number for name in _ALTITUDES if (number := tag_number(xmp.get(name))) is not None), None)
-    if altitude is None and (altitude := tag_number(xmp.get("exif:GPSAltitude"))) is not None:
+    altitude = next((number for name in _ALTITUDES if (number := xmp_metres(xmp, name)) is not None), None)
+    if altitude is None and (altitude := xmp_metres(xmp, "exif:GPSAltitude")) is not None:
         altitude = -abs(altitude) if xmp.get("exif:GPSAltitudeRef") == "1" else altitude
     if latitude is None or longitude is None or latitude == longitude == 0.0:
         return None, None, altitude
     return latitude, longitude, altitude
 
 
+def has_signs(xmp: Mapping[str, str]) -> bool:
+    """Whether both degrees of the position say on which side they count: by a sign, by a letter, or by a tag."""
+    stated = (next((name for name in names if xmp.get(name)), "") for names in (_LATITUDES, _LONGITUDES))
+    return all(name and (re.search(r"[-+NSEW]", xmp[name]) or xmp.get(f"{name}Ref")) for name in stated)
+
+
+def xmp_metres(xmp: Mapping[str, str], name: str) -> float | None:
+    """Of a property that counts in metres, whose unit may stand behind the number."""
+    text = xmp.get(name, "")
+    number = tag_number(text)
+    return metres_of(text) if number is None and "," not in text else number
+
+
+def unread_numbers(xmp: Mapping[str, str]) -> list[str]:
+    """A note on a position, altitudes and angles that XMP states and that are no numbers, as with decimal commas."""
+    degrees = {name: _first_degrees(xmp, [name], 180.0) for name in (*_LATITUDES, *_LONGITUDES)}
+    metres = {name: xmp_metres(xmp, name) for name in (*_ALTITUDES, "drone-dji:RelativeAltitude")}
+    angles = {name: tag_number(xmp.get(name)) for names, _ in _ANGLES for name in names}
+    unread = [name.partition(":")[2] for name, number in (degrees | metres | angles).items()
+              if name in xmp and number is None]  # fmt: skip
+    if not unread:
+        return []
+    return [f"XMP states {', '.join(unread)} in a form that is not read (numbers have a decimal point): not used"]
+
+
 def _first_degrees(xmp: Mapping[str, str], names: Iterable[str], largest: float) -> float | None:
-    """Degrees as a number, whose hemisphere may stand in a tag of its own, or in Adobe's way: "52,30.5712N",
-    "52,30,34.27N"."""
+    """Degrees as a number, whose hemisphere may stand in a tag of its own or as a letter beside it ("N 52.5"), or in
+    Adobe's way: "52,30.5712N", "52,30,34.27N"."""
     for name in names:
         text = xmp.get(name, "")
         number = tag_number(text)
@@ -206,6 +235,8 @@ def _first_degrees(xmp: Mapping[str, str], names: Iterable[str], largest: float)
         if number is None and (parts := _ADOBE_DEGREES.fullmatch(text)):
             number = float(parts[1]) + float(parts[2]) / 60.0 + float(parts[3] or 0.0) / 3600.0
             number = -number if parts[4] in "SW" else number
+        if number is None and (one := _LETTERED.fullmatch(text)) and bool(one[1]) != bool(one[3]):
+            number = -float(one[2]) if one[1] + one[3] in "SW" else float(one[2])
         if number is not None and abs(number) <= largest:
             return number
     return None

@@ -35,8 +35,9 @@ class _Part:
 # What `run` goes through, in order: blocks of eight small images to some of 12 megapixels, preset auto, one job
 # (--log-file tells the seconds of every part).
 _PARTS = (
-    _Part("orient", "first look extract", 0.05), _Part("orient", "first look match", 0.01),
-    _Part("orient", "first look filter", 0.005),
+    _Part("orient", "first pass on given poses extract", 0.05),
+    _Part("orient", "first pass on given poses match", 0.01),
+    _Part("orient", "first pass on given poses filter", 0.005),
     _Part("orient", "first pass extract", 0.14), _Part("orient", "first pass match", 0.02),
     _Part("orient", "first pass filter", 0.01), _Part("orient", "first pass mapping", 0.10),
     _Part("pairs", "pairs", 0.005), _Part("extract", "extract", 0.23), _Part("match", "match", 0.21),
@@ -121,7 +122,7 @@ class _Course:
 
     def _later(self) -> float:
         """Shares of the parts after the present one."""
-        looking = " look " in self._parts[self._place].words
+        looking = " given " in self._parts[self._place].words
         later = self._parts[self._place + 1 :]
         return sum(part.share * (_CHANCE if looking and part.stage == "orient" else 1.0) for part in later)
 

@@ -56,9 +56,9 @@ def load(source: str, overrides: Sequence[str] = (), block: Mapping[str, Any] | 
     if block_given:
         given["block"] = block_given
     if overrides and given:
-        validate(tree, f"{origin} with --set")  # a mistake is one even where an option hides it
+        validate(tree, f"{origin} and --set")  # a mistake is one even where an option hides it
     merge(tree, absolute_paths(given, tree, Path.cwd()))
-    return validate(tree, f"{origin} with the options given" if overrides or given else origin)
+    return validate(tree, f"{origin} and the options given" if overrides or given else origin)
 
 
 def validate(tree: Mapping[str, Any], origin: str = "configuration") -> Settings:
@@ -69,7 +69,7 @@ def validate(tree: Mapping[str, Any], origin: str = "configuration") -> Settings
     except ValidationError as error:
         faults = [describe(fault, Settings, FAMILIES) for fault in root_faults(error.errors())]
     if faults:
-        raise ConfigError(f"{origin} is not valid:\n" + "\n".join(f"  {fault}" for fault in faults))
+        raise ConfigError(f"wrong settings ({origin}):\n" + "\n".join(f"  {fault}" for fault in faults))
     return settings
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.blocks.ground import looks_like_height
 from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.strategies import Strategy
 
@@ -48,7 +49,9 @@ def _absolute_block_path(key: Any, value: Any, folder: Path) -> Any:
         return value
     if key == "images" and "://" in value:
         return value
-    return value if key == "ground" and _is_number(value) else _below(folder, value)
+    if key == "ground" and looks_like_height(value):
+        return value if value[-1:].isdigit() or not Path(_below(folder, value)).exists() else _below(folder, value)
+    return _below(folder, value)
 
 
 def absolute_strategy_paths(values: Mapping[str, Any], strategy: type[Strategy] | None, folder: Path) -> dict[str, Any]:
@@ -66,11 +69,3 @@ def absolute_strategy_paths(values: Mapping[str, Any], strategy: type[Strategy] 
 
 def _below(folder: Path, path: str) -> str:
     return os.path.normpath(folder / os.path.expanduser(path))  # noqa: PTH111 - Path's raises on an unknown user
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

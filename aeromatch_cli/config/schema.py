@@ -135,8 +135,8 @@ class BlockSettings(_Section):
     )
     ground: str = Field(
         "auto",
-        description="Ground height in metres, a DEM file, or `auto` (the terrain that `orient` finds, else from "
-        "relative altitudes).",
+        description="Ground height in metres (or with its unit, such as `112 ft`), a DEM file, or `auto` (the terrain "
+        "that `orient` finds, else from relative altitudes).",
     )
     masks: str = Field(
         "",

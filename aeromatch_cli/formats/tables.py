@@ -61,7 +61,7 @@ def images_text(
         (
             *(getattr(image, name) for name in columns),
             fingerprints[image.image_id],
-            *map(_short, quality.get(image.image_id, unknown)),
+            *(cell if isinstance(cell, str) else _short(cell) for cell in quality.get(image.image_id, unknown)),
         )
         for image in images
     )
@@ -86,7 +86,8 @@ def _quality(path: Path, row: Mapping[str, str]) -> PictureQuality | None:
     if not cells[1]:  # of an earlier version, or not read
         return None
     with readable(path, ValueError):
-        return PictureQuality(*(float(cell or "nan") for cell in cells))
+        blur, black, white = (float(cell or "nan") for cell in cells[:3])
+        return PictureQuality(blur, black, white, *cells[3:])
 
 
 def cameras_text(cameras: Mapping[str, Camera]) -> str:

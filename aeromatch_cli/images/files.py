@@ -6,7 +6,12 @@ The only file that knows OpenCV's BGR.
 from __future__ import annotations
 
 import io
+import os
 import re
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +29,17 @@ from aeromatch_cli.images.png import SIGNATURE, chunks
 # announce (ITU T.81, table B.1): frames, tables, scans, application data, comments.
 _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
 
+# Of files that hold a JPEG.
+JPEG_SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif")
 _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
+# What libjpeg prints of damaged data (jerror.h); it goes on with gray or noise.
+_COMPLAINT = re.compile(
+    r"(Corrupt JPEG data|Premature end of JPEG|Inconsistent progression|Invalid SOS|Unsupported marker)"
+)
+# There is one stderr: threads take turns with it.
+_STDERR = threading.Lock()
 _JPEG_QUALITY = 95
 # Where a PNG says how many bits its numbers have.
 _PNG_BITS = 24
@@ -48,16 +61,21 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
     Invalid are transparent pixels, those of the nodata value in all bands, NaN, and frames of zeros. A file that calls
     every pixel invalid is not believed: some writers leave alpha empty.
     """
+    return read_examined(path, colour=colour)[:2]
+
+
+def read_examined(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None, str]:
+    """The same, and what the decoder complains of, "" for nothing."""
     import cv2
 
-    valid = None
+    valid, complaint = None, ""
     if path.suffix.lower() in gdal.SUFFIXES:
         pixels, valid = gdal.read_bands(path)
     else:
         # Gray straight from the decoder is fastest, but it would cast a 16-bit PNG to 8 bit.
-        straight = not colour and path.suffix.lower() in (".jpg", ".jpeg")
+        straight = not colour and path.suffix.lower() in JPEG_SUFFIXES
         flag = cv2.IMREAD_GRAYSCALE if straight else cv2.IMREAD_UNCHANGED
-        pixels = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+        pixels, complaint = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
         if pixels.ndim == 3 and pixels.shape[2] == 4:
             valid = pixels[..., 3] > 0
             pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
@@ -70,7 +88,7 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
         pixels[~valid] = 0  # like a black frame, whatever the value was: no stretch counts it, no edge is higher
     # Frames are zeros as stored: stretched to 8 bits, the darkest pixels of a picture are 0 too.
     shown = pixels if colour else to_gray8(pixels)
-    return shown, both_valid(valid, without_frames(shown if pixels.dtype == np.uint8 else pixels))
+    return shown, both_valid(valid, without_frames(shown if pixels.dtype == np.uint8 else pixels)), complaint
 
 
 def beyond_bytes(path: Path) -> bool:
@@ -83,24 +101,42 @@ def beyond_bytes(path: Path) -> bool:
     return head.startswith(SIGNATURE) and head[_PNG_BITS:] == b"\x10"
 
 
-def _decode(path: Path, flags: int) -> NDArray[Any]:
+def _decode(path: Path, flags: int) -> tuple[NDArray[Any], str]:
+    """The raster as OpenCV gives it, and what libjpeg complains of."""
     import cv2
 
     check_size(path)
     if path.suffix.lower() in heif.SUFFIXES:
-        return _decoded_heif(path)
+        return _decoded_heif(path), ""
+    said: list[str] = []
     try:
         data = path.read_bytes()
         if fault := _png_fault(data):
             raise ItemError(f"image {path} is {fault}")
-        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+        with _held(said):
+            pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     except (OSError, cv2.error) as error:
         raise ItemError(f"cannot read image {path}: {error}") from None
     if pixels is None:
         raise ItemError(f"cannot decode image {path}: the file is corrupt or no picture; replace or remove it")
     if fault := _jpeg_fault(data):
         raise ItemError(f"image {path} is {fault}")
-    return np.asarray(pixels)
+    return np.asarray(pixels), next((line for line in said if _COMPLAINT.match(line)), "")
+
+
+@contextmanager
+def _held(said: list[str]) -> Iterator[None]:
+    """Gathers the lines that a C library prints to stderr, where nobody could tell which picture they speak of."""
+    with _STDERR, tempfile.TemporaryFile() as lines:
+        kept = os.dup(2)
+        try:
+            os.dup2(lines.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            lines.seek(0)
+            said += lines.read().decode("utf-8", "replace").splitlines()
 
 
 def _decoded_heif(path: Path) -> NDArray[Any]:
@@ -195,9 +231,9 @@ def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
 
     # As it is stored: of 16 bits, gray from the decoder would be 0 below 256, and of colours where they are faint. But
     # a JPEG's colours are noise around zero.
-    flag = cv2.IMREAD_GRAYSCALE if path.suffix.lower() in (".jpg", ".jpeg") else cv2.IMREAD_UNCHANGED
+    flag = cv2.IMREAD_GRAYSCALE if path.suffix.lower() in JPEG_SUFFIXES else cv2.IMREAD_UNCHANGED
     try:
-        stored = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+        stored, _ = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
     except ItemError as error:
         raise ItemError(f"mask: {error}") from None
     # Alpha is no part of it: programs that paint masks leave it opaque everywhere.

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray, PictureQuality
-from aeromatch_cli.images.files import read_raster
+from aeromatch_cli.images.files import read_examined
 
 # Blur is measured in so many parts a side, in the middle of each of them, of so many pixels at most.
 _PARTS, _PART_PX = 4, 256
@@ -36,8 +36,8 @@ _NEAR, _NEAR_STEP, _STEP, _SIGMAS, _LEAST_BLUR, _LEAST_PICTURES = 3, 0.12, 0.2, 
 
 def read_quality(path: Path) -> PictureQuality:
     """Of a file. Raises ItemError where it cannot be decoded."""
-    pixels, valid = read_raster(path, colour=False)
-    return picture_quality(pixels, valid)
+    pixels, valid, complaint = read_examined(path, colour=False)
+    return picture_quality(pixels, valid)._replace(damage=complaint)
 
 
 def picture_quality(gray: NDArray[Any], valid: BoolArray | None) -> PictureQuality:

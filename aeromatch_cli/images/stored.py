@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.images import gdal
+from aeromatch_cli.images.files import JPEG_SUFFIXES
 from aeromatch_cli.images.masks import without_frames
 from aeromatch_cli.images.scaling import shrink_in_strips
 from aeromatch_cli.images.source import Source, read_source
@@ -117,7 +118,7 @@ class StoredRaster:
 
     def _decoded(self) -> Picture:
         # JPEGs have 8 bits: straight from the decoder. Others keep their depth.
-        straight = self._source.path.suffix.lower() in (".jpg", ".jpeg")
+        straight = self._source.path.suffix.lower() in JPEG_SUFFIXES
         pixels, valid = read_source(self._source, colour=not straight)
         gray = _gray(pixels)
         if gray.dtype == np.uint8:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import write_atomically
-from aeromatch_cli.images.files import check_size, read_pixels
+from aeromatch_cli.images.files import JPEG_SUFFIXES, check_size, read_pixels
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.previews import data_uri, jpeg, to_colour8, turned
@@ -32,7 +32,6 @@ _SIDES_PX = ((40, 480), (120, 320))
 _SIDE_PX = 240
 _QUALITY = 70
 _THREADS = 2
-_JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 # EXIF Orientation that takes a turned picture back; the others are their own inverse.
 _INVERSE = {6: 8, 8: 6}
 
@@ -165,7 +164,7 @@ def _encoded(path: Path, side_px: int, exif_orientation: int) -> _Thumbnail:
 
 def _small(path: Path, side_px: int) -> NDArray[np.uint8]:
     """The stored raster, reduced. A JPEG is decoded at reduced size: a tenth of the time."""
-    if path.suffix.lower() in _JPEG_SUFFIXES:
+    if path.suffix.lower() in JPEG_SUFFIXES:
         from PIL import Image as PilImage
 
         check_size(path)

@@ -105,6 +105,8 @@ class PairsResult(StageResult):
     summary: list[str] = Field(description="What is printed of the block, line by line.")
     block: BlockFigures
     warnings: list[str] = Field(description="What a person should look at.")
+    urgent: list[str] = Field([], description="Those of the warnings that --quiet does not hide.")
+    unread: dict[str, str] = Field({}, description="Picture of a kind that is not read -> reason.")
     pairs_sha256: str = Field(description="SHA-256 of pairs.csv.")
 
 

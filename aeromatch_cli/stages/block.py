@@ -23,10 +23,11 @@ from aeromatch_cli.blocks.read import BlockInputs, GivenHeights, block_inputs, r
 from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, ControlPoint, FloatArray, Ground, Image
-from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
+from aeromatch_cli.errors import BrokenFileError, ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json
-from aeromatch_cli.fingerprints import picture_fingerprint
+from aeromatch_cli.fingerprints import contents_digest, picture_fingerprint
+from aeromatch_cli.formats.tables import read_picture_quality
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
@@ -45,7 +46,8 @@ _GSD_TOLERANCE = 0.1
 class BlockRead:
     """A block as it is given, with what was learnt on the way.
 
-    recognised, flights, velocities: as in `read.BlockInputs`. gsd_before_m: gsd_m and
+    recognised, unread, flights, velocities: as in `read.BlockInputs`. urgent: warnings that are said even where quiet
+    is asked for: of pictures that are not read, and of control points none of which is used. gsd_before_m: gsd_m and
     reduced_gsd_m that the workspace had, or None.
     ground_hint: the ground below relative altitudes, and its source.
     """
@@ -60,6 +62,8 @@ class BlockRead:
     control: tuple[ControlPoint, ...]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
+    unread: tuple[tuple[str, str], ...]
+    urgent: frozenset[str]
     recognised: str
     remote: Mapping[str, RemoteFile]
     gsd_before_m: tuple[float | None, float | None]
@@ -106,6 +110,13 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         control=control,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
+        unread=tuple((one.name, one.reason) for one in inputs.unread),
+        urgent=frozenset(
+            [
+                *(line for line in inputs.warnings if any(line.endswith(one.reason) for one in inputs.unread)),
+                *(absent if not control else ()),
+            ]
+        ),
         recognised=inputs.recognised,
         remote=remote,
         gsd_before_m=(before.get("gsd_m"), before.get("reduced_gsd_m"))
@@ -214,7 +225,32 @@ def _read_inputs(
     twice = doubles({image.name: on_disk(remote.get(image.name) or root / image.name) for image in inputs.images})
     inputs = replace(inputs, warnings=(*inputs.warnings, *remarks_on(twice, len(inputs.images))))
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
-    return inputs, {image.image_id: prints[image.name] for image in inputs.images}, remote
+    found = {image.image_id: prints[image.name] for image in inputs.images}
+    places = {image.image_id: remote.get(image.name) or root / image.name for image in inputs.images}
+    return inputs, found | _of_touched(workspace, found, places, executor), remote
+
+
+def _of_touched(
+    workspace: Workspace, found: Mapping[str, str], places: Mapping[str, Path | RemoteFile], executor: Executor
+) -> dict[str, str]:
+    """The fingerprints that pictures had before, where nothing but the time of their file has changed. found: those of
+    now, by image_id."""
+    try:
+        before = read_picture_quality(workspace.images) if workspace.images.is_file() else {}
+    except BrokenFileError:
+        return {}
+    known = {i: (mark, quality.sha256) for (i, mark), quality in before.items() if i in found and quality.sha256}
+    changed = [i for i, (mark, _) in known.items() if mark != found[i]]
+    digests = executor.run(_digest, [places[i] for i in changed], "compare") if changed else []
+    return {i: known[i][0] for i, one in zip(changed, digests, strict=True) if one.value == known[i][1]}
+
+
+def _digest(picture: Path | RemoteFile) -> str:
+    path = on_disk(picture)
+    try:
+        return contents_digest(path)
+    except OSError as error:
+        raise ItemError(f"cannot be read ({error.strerror or error})") from None
 
 
 def _same_crs(given: str, known: str) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGrounds, open_dem
+from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGrounds, open_dem, stated_height_m
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, FloatArray, Ground
@@ -44,7 +44,7 @@ def ground_fingerprint(settings: Settings) -> str:
 def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None, str, tuple[str, ...]]:
     """The ground that settings or the camera file state, where it comes from in words, and remarks; else None."""
     text = settings.block.ground
-    if (z_m := _number(text)) is not None:
+    if (z_m := stated_height_m(text)) is not None:
         if not abs(z_m) <= _FARTHEST_M:
             raise ConfigError(f"--ground {text}: no height in metres; give one, a DEM or auto")
         return ConstantGround(z_m - inputs.origin_m[2]), f"given: {z_m:g} m", ()
@@ -55,13 +55,6 @@ def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None
     if inputs.ground_hint_z_m is not None and inputs.ground_is_stated:
         return ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source, ()
     return None, "", ()
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
 
 
 def judged_ground(

@@ -195,7 +195,7 @@ def evidence_of(
 ) -> tuple[Context, FirstPassMatches]:
     """The context of a first pass that has been run, and its verified matches. look: whether it is a look at given
     poses, which another pass may follow."""
-    prepared = first_pass.prepared(context, recipe, "first look" if look else "first pass")
+    prepared = first_pass.prepared(context, recipe, "first pass on given poses" if look else "first pass")
     first, failed = first_pass.run(prepared, recipe, by_position=by_position)
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
     return first, FirstPassMatches(context.block, pairs, thresholds_px(first), context.given.cameras, failed)

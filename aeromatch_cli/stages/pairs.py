@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,15 +57,14 @@ def prepare(
     for line in given_lines:
         say(line)
     known = [*found.warnings, *as_given.warnings, *_within_memory(settings, executor, found.block)]
-    for warning in known:
-        log.warning("warning: %s", warning)
+    warn(known, found.urgent)
     _check_images(found.block)
     for exporter in settings.export if exports else ():
         exporter.check_images(found.block.images)
     given = _context(settings, workspace, executor, found, shard, overwrite)
     quality = picture_quality.measured(given, dry=dry)
-    for warning in (looks := picture_quality.remarks(given, quality)):
-        log.warning("warning: %s", warning)
+    looks = picture_quality.remarks(given, quality)
+    warn(looks)
     known += looks
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
     report.started += oriented.seconds  # has its own report
@@ -81,6 +80,8 @@ def prepare(
         summary=[*given_lines, *oriented_lines, *summary.lines(), *_remarks(settings)],
         block=summary.figures(),
         warnings=[*known, *said_later],
+        urgent=sorted(found.urgent),
+        unread=dict(found.unread),
         images=len(found.block.images),
         pairs_sha256=hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
     )
@@ -89,14 +90,19 @@ def prepare(
     context = replace(context, pairs=tuple(pairs))
     for line in result.summary:
         say(line)
-    for warning in said_later:
-        log.warning("warning: %s", warning)
+    warn(said_later)
     _check_pairs(context)
     if not dry:
         _write(context, pairs_csv, quality)
         forget_absent(context)
         report.write(workspace)
     return context, oriented, report
+
+
+def warn(warnings: Iterable[str], urgent: Collection[str] = ()) -> None:
+    """Say each; those that are urgent even where quiet is asked for, as errors are."""
+    for warning in warnings:
+        log.log(logging.ERROR if warning in urgent else logging.WARNING, "warning: %s", warning)
 
 
 def _opened(settings: Settings, *, dry: bool) -> Workspace:

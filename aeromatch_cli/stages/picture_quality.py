@@ -9,6 +9,7 @@ from pathlib import Path
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.data import PictureQuality
 from aeromatch_cli.errors import BrokenFileError
+from aeromatch_cli.fingerprints import contents_digest
 from aeromatch_cli.formats.tables import read_picture_quality
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.sharpness import read_quality, shows_nothing, unsharp
@@ -38,7 +39,8 @@ def measured(context: Context, *, dry: bool = False) -> dict[str, PictureQuality
 
 
 def _measure(picture: Path | RemoteFile) -> PictureQuality:
-    return read_quality(on_disk(picture))
+    path = on_disk(picture)
+    return read_quality(path)._replace(sha256=contents_digest(path))
 
 
 def remarks(context: Context, found: Mapping[str, PictureQuality]) -> list[str]:
@@ -48,6 +50,8 @@ def remarks(context: Context, found: Mapping[str, PictureQuality]) -> list[str]:
     cameras: dict[str, list[str]] = defaultdict(list)
     names = {image.image_id: image.name for image in images}
     for image in images:
+        if complaint := found[image.image_id].damage:
+            kinds["are damaged, and a part of them may be gray or noise"].append(f"{image.name} ({complaint})")
         nothing = shows_nothing(found[image.image_id])
         if nothing:
             kinds[f"are almost {nothing}"].append(image.name)

@@ -137,8 +137,7 @@ def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> R
     block = _block_of(reports)
     for line in block.summary:
         said(line)
-    for warning in block.warnings:
-        log.warning("warning: %s", warning)
+    pairs.warn(block.warnings, block.urgent)
     return _result("run", settings, workspace, names, reports, (), said)
 
 
@@ -352,9 +351,10 @@ def _result(
     quality = quality_of(results, names) if command in _JUDGED and not part else None
     lost, urgent = list[Lost](), list[str]()
     if quality is not None:
-        lost = lost_images(results, first.failures, names)
+        unread = [*first.failures, *_block_of(reports).unread.items()]
+        lost = lost_images(results, unread, names)
         write_lost(workspace, lost)
-        told_lost = lost_lines(workspace, lost, len(names) + len(first.failures))
+        told_lost = lost_lines(workspace, lost, len(names) + len(unread))
         lines += [*closing_lines(quality, results, names), *told_lost]
         urgent = [*([] if quality.verdict == "good" else verdict_lines(quality)), *told_lost]
     lines.append(f"workspace {workspace.root}")
@@ -428,14 +428,12 @@ def _check(context: Context, oriented: StageReport, first: StageReport, said: _S
     settled = oriented.result is not None or context.settings.first_pass is None
     read, quality = _block_of([first]), picture_quality.measured(context)
     looks = picture_quality.remarks(context, quality)
-    for warning in looks:
-        if warning not in read.warnings:
-            log.warning("warning: %s", warning)
+    pairs.warn(warning for warning in looks if warning not in read.warnings)
     found = check.run(context, time.perf_counter() - first.started, len(first.failures), oriented=settled)
     lines = (*said.rest(read.summary), *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     for _, item, reason in failures:
-        log.error("failed: %s: %s", item, reason)
+        log.warning("failed: %s: %s", item, reason)  # quiet has its own way
     facts = {
         "warnings": [*dict.fromkeys([*read.warnings, *looks])],
         "estimate": found.estimate,

@@ -54,20 +54,25 @@ def read_gcp_list(source: Source) -> Survey:
         stated = described_crs(source.at(records[0][0]), records[0][1])
         across, up = (said.across_m or stated.across_m) / stated.across_m, (said.up_m or stated.up_m) / stated.up_m
         factors = across, across, up
+    exchanged = all(_names_exchanged(record) for _, record in records[1:])
     points: dict[str, SurveyedPoint] = {}
     marks: list[Mark] = []
     for line, record in records[1:]:
-        point, one = _row(source, line, record, factors, said.accuracy_m or 1.0)
+        point, one = _row(source, line, record, factors, said.accuracy_m or 1.0, exchanged=exchanged)
         known = points.setdefault(point.name, point)
         if any(abs(a - b) > _SAME * max(1.0, abs(a)) for a, b in zip(known.position, point.position, strict=True)):
             raise ConfigError(f"{source.at(line)}: {point.name} has other coordinates than before: one is wrong")
         points[point.name] = replace(known, check=known.check or point.check, sigmas_m=known.sigmas_m or point.sigmas_m)
         marks.append(one)
     named = [name for name in points if name.upper().startswith(_CHECK_NAME)]
-    remarks = [f"{source.path.name}: {len(named)} points are check points by their name ({_CHECK_NAME}...)"]
+    remarks = []
+    if named:
+        remarks.append(f"{source.path.name}: {len(named)} points are check points by their name ({_CHECK_NAME}...)")
+    if exchanged:
+        remarks.append(f"{source.path.name}: the names of image and point are exchanged: they were put right")
     return Survey(
         tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]),
-        remarks=(*(remarks if named else ()), *said.remarks(source)), measured_in=source.path, heights=said.said.zero,
+        remarks=(*remarks, *said.remarks(source)), measured_in=source.path, heights=said.said.zero,
     )  # fmt: skip
 
 
@@ -88,13 +93,27 @@ def _starts_with_numbers(record: str) -> bool:
     return bool(cells) and is_number(cells[0])
 
 
+def _names_exchanged(record: str) -> bool:
+    """Whether the name of an image stands where the point's does, and none where it should."""
+    cells = fields_of(record)[0]
+    return len(cells) > 6 and bool(IMAGE.fullmatch(cells[6])) and not IMAGE.fullmatch(cells[5])
+
+
 def _row(
-    source: Source, line: int, record: str, factors: tuple[float, float, float], accuracy_m: float
+    source: Source,
+    line: int,
+    record: str,
+    factors: tuple[float, float, float],
+    accuracy_m: float,
+    *,
+    exchanged: bool,
 ) -> tuple[SurveyedPoint, Mark]:
-    """accuracy_m: metres of one unit of accuracies."""
+    """accuracy_m: metres of one unit of accuracies. exchanged: whether the names of image and point are."""
     fields, comma = fields_of(record)
     while fields and not fields[-1]:
         fields.pop()
+    if exchanged:
+        fields[5:7] = fields[6:4:-1]
     cells = with_name(fields, 5)
     if len(cells) < 6:
         raise ConfigError(f"{source.at(line)}: {len(cells)} columns, expected {_COLUMNS}")

@@ -41,7 +41,8 @@ _EARTH_M = (6.2e6, 6.6e6)
 
 
 def is_reference(source: Source) -> bool:
-    return any(re.match(r"#\s*(coordinatesystem\s*:|label\b)", line, re.IGNORECASE) for line in source.lines[:3])
+    lines = map(_unquoted, source.lines[:3])
+    return any(re.match(r"#\s*(coordinatesystem\s*:|label\b)", line, re.IGNORECASE) for line in lines)
 
 
 def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
@@ -54,7 +55,7 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     used_estimated = disabled = 0
     separator, angles = ",", _ANGLES[0]
     for line, text in enumerate(source.lines, start=1):
-        stripped = text.strip()
+        stripped = _unquoted(text)
         stated = re.match(r"#\s*coordinatesystem\s*:\s*(.*)", stripped, re.IGNORECASE)
         if stated:
             system, stated_one = described_crs(source.at(line), stated[1]), True
@@ -69,7 +70,7 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             if not columns:
                 raise ConfigError(f"{source.at(line)}: no line that names the columns (#Label,...) stands before")
             cells = next(csv.reader([text], delimiter=separator))
-            record = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
+            record = _by_axis(dict(zip(columns, (cell.strip() for cell in cells), strict=False)))
             if record.get("enable", "1").lower() in ("0", "false"):
                 disabled += 1
             row, from_estimate = _row(
@@ -93,6 +94,26 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     return PoseList(tuple(rows), system.kind, warnings, title, system.crs, heights=system.heights)
 
 
+def _unquoted(line: str) -> str:
+    """A comment as it was before a spreadsheet has put it, or its parts between commas, in quotes."""
+    text = line.strip()
+    if not text.startswith('"#'):
+        return text
+    return ",".join(next(csv.reader([text]))).rstrip(",; \t")
+
+
+def _by_axis(record: dict[str, str]) -> dict[str, str]:
+    """With a column for every axis in place of one that holds several: `0.03/0.03/0.06` of accuracy_x/y/z."""
+    found: dict[str, str] = {}
+    for name, cell in record.items():
+        axes, values = name.removeprefix("accuracy_").split("/"), cell.split("/")
+        if name.startswith("accuracy_") and len(axes) == len(values) > 1:
+            found |= {f"accuracy_{axis}": value for axis, value in zip(axes, values, strict=True)}
+        else:
+            found[name] = cell
+    return found
+
+
 def _column(cell: str) -> tuple[str, str]:
     """x, y, z, yaw, ..., x_est, accuracy_x, ... of Metashape's names, and the unit that they state."""
     name, unit = named_column(cell, {})
@@ -112,6 +133,8 @@ def _factors(where: str, columns: Sequence[str], units: Sequence[str], system: S
             stem = name.removesuffix("_est")
             one = system.up_m if stem == "z" else system.across_m if stem in ("x", "y") else 1.0
             found[name] = factor(where, name, unit, "angle" if turns else "length") / one
+            if name.startswith("accuracy_"):
+                found |= {f"accuracy_{part}": found[name] for part in parts}
     return found
 
 

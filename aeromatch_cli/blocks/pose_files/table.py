@@ -22,6 +22,7 @@ from aeromatch_cli.blocks.pose_files import (
     odm,
     opensfm,
     pix4d,
+    preambles,
     scenes,
     tables,
 )
@@ -146,6 +147,9 @@ POSE_FORMATS: Mapping[str, PoseFormat] = {
     "inpho": PoseFormat("Inpho project .prj", tables.read_inpho, tables.is_inpho),
     "pix4d-cameras": PoseFormat(
         "Pix4D *_calibrated_camera_parameters.txt", pix4d.read_camera_parameters, pix4d.is_camera_parameters
+    ),
+    "report": PoseFormat(
+        "report with text above the names of its columns (POSPac)", preambles.read_report, preambles.is_report
     ),
     "patb": PoseFormat("PATB orientations", tables.read_patb, tables.is_patb),
     "pix4d": PoseFormat("Pix4D geolocation without header", pix4d.read_geolocation, pix4d.is_geolocation, plain=True),

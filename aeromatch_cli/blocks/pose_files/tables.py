@@ -43,13 +43,15 @@ _NAMES = ("name", "x", "y", "z", "a1", "a2", "a3")
 _GON_DEG = 0.9
 _ORIA = "ORIA"
 _FULL_DEG = 360.0
+# A number of a strip or a camera, or a mark, behind the angles.
+_FURTHER = re.compile(r"\d{1,6}")
 
 
 def is_plain_table(source: Source) -> bool:
     if has_header(source.lines):
         return False
     records = [record for _, (_, record) in zip(range(3), source.records(), strict=False)]
-    tables = [with_name(fields_of(record)[0], 0) for record in records]
+    tables = [_without_further(with_name(fields_of(record)[0], 0)) for record in records]
     return bool(tables) and all(
         (len(cells) == len(_NAMES) and all(map(is_number, cells[1:])) and not is_number(cells[0]))
         or (len(cells) == len(_NAMES) and all(map(is_number, cells)))
@@ -57,12 +59,19 @@ def is_plain_table(source: Source) -> bool:
     )
 
 
+def _without_further(cells: list[str]) -> list[str]:
+    """Without one whole number behind the angles."""
+    return cells[:-1] if len(cells) == len(_NAMES) + 1 and _FURTHER.fullmatch(cells[-1]) else cells
+
+
 def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseList:
     """order: "opk" or "pok". unit: "deg" or "gon". "" for what is usual. Raises ConfigError with line and column."""
-    table = []
+    table, more = [], False
     for line, record in source.records():
         fields, comma = fields_of(record)
-        cells = with_name(fields, 0)
+        named = with_name(fields, 0)
+        cells = _without_further(named)
+        more |= cells != named
         if len(cells) != len(_NAMES):
             raise ConfigError(f"{source.at(line)}: {len(cells)} values instead of {', '.join(_NAMES)}")
         values = [
@@ -91,6 +100,7 @@ def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseLis
                 attitude=(float(first), float(second), float(kappa)), attitude_kind="omega_phi_kappa",
             )  # fmt: skip
         rows.append(replace(row, numbered=numbered))
+    behind = (f"{source.path.name}: what stands behind the angles is not read",) if more else ()
     unit_words = {_GON_DEG: "gon", 1.0: "degrees"}.get(one_deg, "radians")
     words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {unit_words}"
     remarks: tuple[str, ...] = ()
@@ -100,7 +110,8 @@ def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseLis
             "opk-gon, pok or pok-gon reads them otherwise",
         )
     title = f"table without header, {words}"
-    return PoseList(tuple(rows), "grid", (*remarks, *said.remarks(source)), title, heights=said.said.zero)
+    remarks = (*remarks, *behind, *said.remarks(source))
+    return PoseList(tuple(rows), "grid", remarks, title, heights=said.said.zero)
 
 
 read_opk, read_opk_gon = (
