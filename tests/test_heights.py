@@ -199,7 +199,7 @@ def dem_context(terrain: Terrain, shape: np.ndarray, sigma_m: float) -> Any:
     }
     return SimpleNamespace(
         block=SimpleNamespace(ground=dem, ground_source="DEM dem.tif", poses=poses),
-        settings=SimpleNamespace(orient=None, block=SimpleNamespace(sigma_position_m=5.0)),
+        settings=SimpleNamespace(keeps_poses=False, block=SimpleNamespace(sigma_position_m=5.0)),
     )
 
 

@@ -11,7 +11,7 @@ from aeromatch_cli.fingerprints import file_digest, fingerprint
 # Source that answers depend on, below the package or scripts. Peers read no more of the package than lens models.
 PEER_CODE = ("geometry/cameras.py", "geometry/frames.py", "benchmarks/peers", "benchmarks/processes.py")
 OUR_CODE = (
-    "blocks", "geometry", "nets", "orientation", "stages", "strategies", "data.py", "formats", "images",
+    "blocks", "geometry", "nets", "sfm", "stages", "strategies", "data.py", "formats", "images",
     "lab/strategies", "benchmarks/peers/ours.py",
 )  # fmt: skip
 # Peers on rectified views read what makes these, too.
