@@ -10,6 +10,7 @@ import textwrap
 import types
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,16 @@ from make_features import described
 from read_pages import ROOT, text_of
 from test_export_colmap import make_truth
 
+from aeromatch_cli import graph
 from aeromatch_cli.blocks.pose_files.source import Source
+from aeromatch_cli.blocks.pose_files.table import POSE_FORMATS
 from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.data import Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import output, scores, totals
 from aeromatch_cli.fingerprints import fingerprint
+from aeromatch_cli.results import stages as results
+from aeromatch_cli.workspace import Workspace
 
 PAGE = text_of(ROOT / "docs" / "extending.md")
 NEW_FILE = re.compile(r"(?m)^`(aeromatch_cli/[\w/]+\.py)`:\n\n((?:(?: {4}.*)?\n)+)")
@@ -33,9 +38,23 @@ def new_files() -> dict[str, str]:
     return {path: textwrap.dedent(code) for path, code in NEW_FILE.findall(PAGE)}
 
 
+def snippet(first: str) -> str:
+    """The code of the page that begins with these words, up to the end of its block."""
+    found = re.search(rf"(?m)^ {{4}}{re.escape(first)}(?:.*\n)(?:(?: {{4}}.*)?\n)*", PAGE)
+    assert found is not None, first
+    return textwrap.dedent(found[0]).strip()
+
+
 @pytest.fixture
-def made() -> Iterator[dict[str, Any]]:
-    """Modules of the page by file name."""
+def made(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
+    """Modules of the page by file name; what the page's stage adds to other modules is there as well."""
+    names: dict[str, Any] = {**vars(results), **vars(graph)}
+    exec(snippet("class ConnectionsResult"), names)
+    monkeypatch.setattr(results, "ConnectionsResult", names["ConnectionsResult"], raising=False)
+    stage = eval(snippet('Stage("connections"'), names)[0]
+    monkeypatch.setattr(graph, "BY_NAME", {**graph.BY_NAME, stage.name: stage})
+    exec(snippet("@property\n    def connections"), names)
+    monkeypatch.setattr(Workspace, "connections", names["connections"], raising=False)
     modules = {}
     for path, code in new_files().items():
         module = types.ModuleType(f"extending_{Path(path).stem}")
@@ -47,9 +66,9 @@ def made() -> Iterator[dict[str, Any]]:
         del sys.modules[module.__name__]
 
 
-def test_the_page_has_three_files_of_thirty_odd_lines_in_folders_that_exist() -> None:
+def test_the_page_has_four_files_of_thirty_odd_lines_in_folders_that_exist() -> None:
     files = new_files()
-    assert [Path(path).name for path in files] == ["distance.py", "geojson_poses.py", "tiepoints.py"]
+    assert [Path(path).name for path in files] == ["distance.py", "mission_log.py", "tiepoints.py", "connections.py"]
     for path, code in files.items():
         assert (ROOT / path).parent.is_dir()
         assert not (ROOT / path).exists()
@@ -82,23 +101,51 @@ def test_the_matcher_finds_what_is_alike(made: dict[str, Any]) -> None:
 
 
 def test_the_pose_format_is_read(made: dict[str, Any], tmp_path: Path) -> None:
-    point = {"type": "Point", "coordinates": [13.4, 52.5, 142.0]}
-    angles = {"yaw": 350.0, "pitch": -90.0, "roll": 0.0}
-    features = [
-        {"type": "Feature", "geometry": point, "properties": {"image": "a.jpg", **angles}},
-        {"type": "Feature", "geometry": point, "properties": {"image": "b.jpg"}},
-    ]
-    path = tmp_path / "shots.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}), encoding="utf-8")
-    reader = made["geojson_poses"]
-    assert reader.is_geojson(Source(path))
-    first, second = reader.read_geojson(Source(path)).rows
+    place = {"lat": 52.5, "lon": 13.4, "alt": 142.0}
+    photos = [{"image": "a.jpg", **place, "yaw": 350.0, "pitch": 1.0, "roll": 0.0}, {"image": "b.jpg", **place}]
+    path = tmp_path / "flight.json"
+    path.write_text(json.dumps({"photos": photos}), encoding="utf-8")
+    reader = made["mission_log"]
+    assert reader.is_mission_log(Source(path))
+    first, second = reader.read_mission_log(Source(path)).rows
     assert (first.image, first.position, first.position_kind) == ("a.jpg", (52.5, 13.4, 142.0), "geographic")
-    assert (first.attitude, first.attitude_kind) == ((350.0, -90.0, 0.0), "yaw_pitch_roll")
+    assert (first.attitude, first.attitude_kind) == ((350.0, 1.0, 0.0), "yaw_pitch_roll")
     assert (second.attitude, second.attitude_kind) == (None, "none")
-    path.write_text('{"features": [{"properties": {}}]}', encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"shots\.geojson, feature 1: needs properties\.image"):
-        reader.read_geojson(Source(path))
+    path.write_text('{"photos": [{"image": "a.jpg"}]}', encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"flight\.json, photo 1: needs image, lat, lon and alt"):
+        reader.read_mission_log(Source(path))
+    for text in ('{"photos": ["a.jpg"]}', '{"photos": [{"image": "a.jpg", "lat": "n"}]}'):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(ConfigError, match="photo 1"):
+            reader.read_mission_log(Source(path))
+
+
+def test_names_of_the_page_are_new() -> None:
+    """What a page adds must not be there: its table line would replace another."""
+    added = {"match": "distance", "export": "tiepoints"}
+    assert [name for family, name in added.items() if name in FAMILIES[family]] == []
+    assert '"mission-log": PoseFormat' in PAGE
+    assert "mission-log" not in POSE_FORMATS
+    assert "connections" not in graph.BY_NAME
+
+
+def test_the_stage_writes_its_table_where_it_is_not_up_to_date(made: dict[str, Any], tmp_path: Path) -> None:
+    module = made["connections"]
+    pairs = tuple(Pair("a", second, 0.5, 10.0, "overlap") for second in ("b", "c"))
+    entries = [
+        (pair, SimpleNamespace(matches=SimpleNamespace(indices=range(n))))
+        for pair, n in zip(pairs, (7, 0), strict=True)
+    ]
+    context = SimpleNamespace(workspace=Workspace(tmp_path), pairs=pairs, overwrite=False)
+    module.with_current_pairs = lambda context: (context, [])
+    module.pair_fingerprint = lambda _, pair: pair.image_id1
+    module.final_pairs = lambda _: entries
+    first, second = module.run(context), module.run(context)
+    assert ((first.done, first.skipped), (second.done, second.skipped)) == ((1, 0), (0, 1))
+    assert first.result.connected_pairs == second.result.connected_pairs == 1
+    assert (tmp_path / "connections.csv").read_text(encoding="utf-8").splitlines()[1:] == ["a,b,7"]
+    module.pair_fingerprint = lambda _, pair: pair.image_id1 + " with other settings"
+    assert module.run(context).done == 1
 
 
 def test_the_exporter_writes_every_verified_match(made: dict[str, Any], tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -31,6 +32,20 @@ def test_what_follows_from_the_declarations() -> None:
     assert [graph.first_reader(key) for key in ("block.gcp", "block.poses", "cascade", "seed", "run.jobs")] == [
         "adjust", "orient", "match", "filter", ""
     ]  # fmt: skip
+
+
+def test_the_diagram_of_the_documentation_shows_the_declarations() -> None:
+    """Of docs/design.md: stage, unit, what it reads and what it writes, in columns."""
+    text = (Path(__file__).parent.parent / "docs" / "design.md").read_text(encoding="utf-8")
+    common = re.search(r"M: ([a-z ]+)\n", text)
+    assert common is not None
+    shown = re.findall(r"(?m)^    (\w+) +(image|pair|block)   (.+?)   +([a-z ]+)$", text)
+    for name, unit, reads, writes in shown:
+        stage = graph.BY_NAME[name]
+        assert unit == stage.unit
+        assert set(reads.replace("M", common[1]).split()) == set(stage.reads or "-"), name
+        assert tuple(writes.split()) == stage.writes, name
+    assert tuple(name for name, *_ in shown) == graph.RUN
 
 
 def test_every_command_of_a_stage_is_declared() -> None:

@@ -294,7 +294,7 @@ def _weak_images(model: Any) -> set[int]:
 
 
 def _once_per_image(model: Any) -> None:
-    """Of two keypoints of an image that see one point the nearer to its projection stays: merged tracks have both."""
+    """Keep one keypoint of an image per point, the nearest to its projection: merged tracks hold several."""
     for number, point in list(model.points3D.items()):
         images = [element.image_id for element in point.track.elements]
         if len(set(images)) == len(images):

@@ -69,8 +69,8 @@ def tied_parts(adjusted: AdjustedBlock) -> list[int]:
 
 
 def _ground_pixel_m(adjusted: AdjustedBlock, camera_ids: Mapping[str, str]) -> float | None:
-    """What a pixel is on the ground: median over the images that positions have placed of the distance of their points
-    over the focal length; None without any."""
+    """Return the size of a pixel on the ground, metres: the median over the images that positions have placed of the
+    distance of their points over the focal length; None without any."""
     sizes = []
     for image_id, pose in adjusted.poses.items():
         track = adjusted.tracks.get(image_id)
@@ -81,6 +81,6 @@ def _ground_pixel_m(adjusted: AdjustedBlock, camera_ids: Mapping[str, str]) -> f
 
 
 def _median(values: Sequence[float]) -> float | None:
-    """Of those that are known; None where none is."""
+    """Return the median of the known values; None where none is known."""
     known = [value for value in values if np.isfinite(value)]
     return float(np.median(known)) if known else None

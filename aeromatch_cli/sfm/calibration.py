@@ -1,4 +1,4 @@
-"""What is known of a camera before the block is adjusted, and the camera that an adjustment has found.
+"""Calibration: what is known of a camera before the adjustment, and the camera that an adjustment has found.
 
 Every parameter of Brown's model is an unknown with a prior: its stated value and a standard deviation by where that
 comes from. What the block does not determine stays near its prior.
@@ -64,7 +64,8 @@ def camera_of(lens: FloatArray, given: Camera) -> Camera:
 
 
 def lens_prior(camera: Camera, focal_sigma: float) -> LensPrior:
-    """What is known of a camera. focal_sigma: standard deviation of its focal length, as a share of it."""
+    """Return what is known of a camera before the adjustment: values and standard deviations of its parameters.
+    focal_sigma: standard deviation of its focal length, as a share of it."""
     lens, focal = lens_of(camera), focal_px(camera)
     middle = (camera.width_px - 1) / 2.0, (camera.height_px - 1) / 2.0
     stated = bool(lens[3:10].any()) or not np.allclose(lens[1:3], middle, atol=1.0)

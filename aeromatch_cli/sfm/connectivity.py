@@ -1,4 +1,4 @@
-"""Which matches are probable enough to stay, so that no image loses its block by it."""
+"""This module chooses which matches are probable enough to stay, so that no image is cut off from its block."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ _BRIDGING = 30
 def probable_enough(
     ends: Sequence[tuple[str, str]], likely: Sequence[FloatArray | None], least: float, min_matches: int
 ) -> list[BoolArray | None]:
-    """Of every pair, which of its matches (M,) are as probable as asked; None where nothing is known of it.
+    """Return, for every pair, which of its matches (M,) are as probable as asked; None where no probabilities are
+    known.
 
     Where images that pairs have tied would fall apart by that, the pairs between the parts keep their best 30 matches:
     a block whose flights lie a few pixels off each other is worth more than flights that nothing connects. ends: image

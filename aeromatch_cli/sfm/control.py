@@ -1,4 +1,5 @@
-"""How well an adjusted block lies on surveyed points: a similarity, and its errors at points that it does not use."""
+"""This module compares an adjusted block with surveyed points: a similarity, and its errors at points that it does not
+use."""
 
 from __future__ import annotations
 
@@ -133,7 +134,7 @@ def _independent_errors(
 
 
 def offset_words(control: Control) -> str:
-    """How the block, as it is exported, lies to the control points, of which there are three or more."""
+    """Say in words how the exported block lies to the control points, of which there are three or more."""
     assert control.transformation is not None
     scale = control.transformation.scale
     if control.offset_m is None:

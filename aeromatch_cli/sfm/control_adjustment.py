@@ -180,7 +180,7 @@ class _Block:
         return intersected(self.state.centers_m[[k for k, _, _ in seen]], np.array(rays).reshape(-1, 3))
 
     def _camera(self, image: int) -> Camera:
-        """Of an image; the size of its pictures plays no part."""
+        """Return the camera of an image; the size of its pictures plays no part."""
         camera = self.network.camera[image]
         kind = Camera(FISHEYE if self.network.fisheye[camera] else BROWN, 0, 0, ())
         return camera_of(self.state.lens[camera], kind)
@@ -233,7 +233,7 @@ def _size(errors_m: FloatArray) -> float:
 
 
 def _rms(errors_m: FloatArray) -> Xyz | None:
-    """None where rays of a point do not meet, or there is none."""
+    """Return the root mean square (3,) of errors (N, 3), metres; None without points, or where rays do not meet."""
     if not len(errors_m) or not np.isfinite(errors_m).all():
         return None
     return xyz(np.round(np.sqrt((errors_m**2).mean(axis=0)), 4))

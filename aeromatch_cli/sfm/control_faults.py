@@ -1,4 +1,4 @@
-"""What is wrong with a list of control points as a whole: a unit, exchanged axes, a sign."""
+"""This module finds what is wrong with a list of control points as a whole: a unit, exchanged axes, a sign."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which other reading of the given angles agrees with the attitudes that the pictures show.
+"""This module finds which other reading of the given angles agrees with the attitudes that the images show.
 
 Angles that are wrong as a whole are seldom random: columns are exchanged, a sign or a zero is another, degrees are
 gon. Each such reading is tried on all images at once; the first that fits nearly as well as the best is what happened.
@@ -110,7 +110,7 @@ def _as_read(angles: Angles) -> FloatArray:
 
 
 def _readings(angles: list[Angles]) -> Iterator[tuple[str, Reading]]:
-    """What may be wrong, in words, and the right reading; the most usual faults first."""
+    """Yield what may be wrong, in words, and the right reading; the most usual faults come first."""
     kind = angles[0].kind
     if kind == "yaw_pitch_roll":
         other = "nadir" if angles[0].forward else "gimbal"
@@ -186,14 +186,14 @@ def _median_deg(rotations: FloatArray, true: FloatArray, free_deg: float) -> flo
 
 
 def _turns(rotations: FloatArray, true: FloatArray) -> Any:
-    """Of the world, from each true attitude to the given one."""
+    """Return the turns of the world (N) from each true attitude to the given one; rotations, true: (N, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(true.transpose(0, 2, 1) @ rotations)
 
 
 def _of_the_frame(turns: Any, free_deg: float) -> Any:
-    """What all turns have in common by the frame's own error: a small tilt, and a heading up to free_deg."""
+    """Return the turn that all turns share by the frame's own error: a small tilt, and a heading up to free_deg."""
     from scipy.spatial.transform import Rotation
 
     common = np.median(turns.as_rotvec(degrees=True), axis=0)

@@ -56,7 +56,7 @@ class GroundPoints:
 
     @classmethod
     def joined(cls, parts: Sequence[GroundPoints]) -> GroundPoints:
-        """Of several sets of pairs, no pair of which is in two."""
+        """Join several sets of pairs, no pair of which is in two."""
         shifts = np.cumsum([0, *(int(part.pair_idx.max(initial=-1)) + 1 for part in parts)])
         return cls(
             np.concatenate([np.zeros((0, 3)), *(part.points_m for part in parts)]),

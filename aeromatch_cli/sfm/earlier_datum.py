@@ -1,4 +1,5 @@
-"""Where several models of one block lie: placed ones in the world, on poses found before, the others beside them."""
+"""This module decides where several models of one block lie: placed ones in the world, on poses found before, the
+others beside them."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ _GAP_EXTENTS, _GAP_M = 2.0, 1000.0
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """What an earlier run found for images that have not changed: poses, and cameras by camera_id.
+    """Holds what an earlier run found for images that have not changed: poses, and cameras by camera_id.
 
     placed: images that positions had placed; the others lay in a frame of their own, or beside these.
     """

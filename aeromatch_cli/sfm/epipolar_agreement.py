@@ -1,4 +1,4 @@
-"""Which given poses explain the matches of the first pass, as exactly as these are."""
+"""This module decides which given poses explain the matches of the first pass, as exactly as these are."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def explained_share(
 def explained_matches(
     pair: PairPoints, poses: Mapping[str, Pose], cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]
 ) -> BoolArray:
-    """Which of a pair's matches (M,) both given poses explain, none where one has no attitude.
+    """Return which of a pair's matches (M,) both given poses explain, none where one has no attitude.
 
     A match is explained when it lies near its epipolar line, and its rays do not meet behind a camera: epipolar lines
     alone do not tell a flight from the same flown backwards.
@@ -119,8 +119,8 @@ def triangulated(
 
 
 def heights_above_m(given: Ground, terrain: Ground, centers_m: FloatArray) -> tuple[float, float, float]:
-    """How far a given ground lies above the terrain found, the median deviation from that, and the flying height above
-    the terrain: medians, metres.
+    """Return how far a given ground lies above the terrain found, the median deviation from that, and the flying height
+    above the terrain: medians, metres.
 
     centers_m: (N, 3) projection centres, below which both are asked.
     """

@@ -1,4 +1,4 @@
-"""Which focal lengths the pictures and EXIF speak for, where those of a camera file cannot be right.
+"""This module decides which focal lengths images and EXIF support, where those of a camera file cannot be right.
 
 Given poses explain matches with the right focal length alone, unless all images look straight down on flat ground:
 there any focal length goes with some flying height, and EXIF decides.
@@ -94,7 +94,8 @@ def _mean_error(
     cameras: Mapping[str, Camera],
     thresholds_px: Mapping[str, float],
 ) -> float:
-    """Of matches of posed pairs: Sampson distances in units of that of an exact match, at most 1 each."""
+    """Return the mean Sampson distance of the matches of posed pairs in units of that of an exact match, at most 1
+    each."""
     errors = []
     for pair, points0, points1 in zip(pairs, *_undistorted(pairs, cameras), strict=True):
         ids = pair.image_id0, pair.image_id1

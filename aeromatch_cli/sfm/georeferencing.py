@@ -1,4 +1,5 @@
-"""Where an oriented model lies in the world: by the given positions, else levelled by the ground that it sees.
+"""Georeferencing places an oriented model in the world by the given positions, else levels it by the ground that it
+sees.
 
 A mapper gives poses and points up to a similarity. Positions that are spread in two directions determine it, the
 worse the closer they lie together; positions along one line leave the turn about the line open; without positions the
@@ -220,7 +221,7 @@ class _Measured:
 
 
 def delay_s(centers: FloatArray, positions_m: FloatArray, velocities_m_s: FloatArray) -> float:
-    """By how much positions lag behind the exposures, seconds; 0 where that does not make them fit far better.
+    """Return by how much positions lag behind the exposures, seconds; 0 where that does not make them fit far better.
 
     Roughly, as a start: an adjustment finds it exactly. centers, positions_m: (N, 3) as of `place`; velocities_m_s:
     (N, 3) of the aircraft, zero where they are not known.

@@ -38,7 +38,7 @@ class Part:
     points_m: Mapping[int, FloatArray]
 
     def moved(self, by: Similarity) -> Part:
-        """In another frame: scale, rotation and translation."""
+        """Return the part in another frame, by a similarity of scale, rotation and translation."""
         scale, rotation, shift_m = by
         return replace(
             self,
@@ -84,7 +84,7 @@ def _joined_once(parts: Sequence[Part], matches: Mapping[tuple[int, int], IntArr
 
 
 def _tie(target: Part, part: Part, matches: Mapping[tuple[int, int], IntArray]) -> Similarity | None:
-    """What takes a part to the target, None where too few points are the same."""
+    """Return the similarity that takes a part to the target, None where too few points are the same."""
     here, there = [], []
     for (first, second), indices in matches.items():
         if first in target.points_m and second in part.points_m:

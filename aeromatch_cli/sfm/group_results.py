@@ -1,4 +1,5 @@
-"""What an adjustment says of a group of images: calibration, accuracy of observations, expected deformation."""
+"""This module states what an adjustment says of a group of images: calibration, accuracy of observations, expected
+deformation."""
 
 from __future__ import annotations
 
@@ -76,7 +77,7 @@ def adjusted_group(group: GroupResult, outcome: Outcome, given: Given, names: Na
 
 
 def _positions(outcome: Outcome, given: Given, names: Names) -> PositionResiduals | None:
-    """How positions agree with the adjusted block.
+    """Return how positions agree with the adjusted block.
 
     Positions that were left out before the adjustment, because they lay too far off, count as wrong ones.
     """
@@ -102,7 +103,7 @@ def _positions(outcome: Outcome, given: Given, names: Names) -> PositionResidual
 
 
 def _offsets(outcome: Outcome, off_m: FloatArray, used: BoolArray, names: Names) -> list[FlightOffset]:
-    """Of every flight with used positions, by how much these lie off on average, and how they scatter."""
+    """Return, for every flight with used positions, by how much these lie off on average, and how they scatter."""
     flight = outcome.result.network.flight
     listed = []
     for row, number in enumerate(outcome.flights):
@@ -118,7 +119,7 @@ def _rms(values: FloatArray) -> Xyz | None:
 
 
 def _flights(outcome: Outcome, names: Names) -> list[FlightCorrection]:
-    """What was found of flights: steps of height taken out before, shifts, delays of positions."""
+    """Return what was found of flights: steps of height taken out before, shifts, delays of positions."""
     network, state, found = outcome.result.network, outcome.result.state, outcome.result.found
     listed = []
     for row, number in enumerate(outcome.flights):
@@ -135,7 +136,7 @@ def _flights(outcome: Outcome, names: Names) -> list[FlightCorrection]:
 
 
 def _mounts(outcome: Outcome, names: Names) -> dict[str, Mount]:
-    """By camera."""
+    """Return boresight and lever arm of every camera, by camera_id."""
     network, state, found = outcome.result.network, outcome.result.state, outcome.result.found
     mounts = {}
     for row, number in enumerate(outcome.cameras):
@@ -194,7 +195,7 @@ def _calibration(outcome: Outcome, row: int, names: Names) -> Calibration:
 
 
 def _changes(change: FloatArray) -> dict[str, float]:
-    """By parameter, of those (12,) that change."""
+    """Return, by name of parameter, those of the changes (12,) that are not zero."""
     return {LENS[k]: float(change[k]) for k in np.flatnonzero(change)}
 
 
@@ -228,7 +229,7 @@ def _heights(network: Network, state: Unknowns, found: Covariance, *, metric: bo
 
 
 def _ground_pixel(network: Network, state: Unknowns) -> float:
-    """What a pixel is on the ground, in units of the frame: median over images of those of their points."""
+    """Return the size of a pixel on the ground, in units of the frame: a median over images of medians over points."""
     away = state.points_m[network.point] - state.centers_m[network.image]
     depths = np.einsum("mi,mi->m", away, state.rotations[network.image, 2])
     pixels = depths / state.lens[network.camera[network.image], 0]

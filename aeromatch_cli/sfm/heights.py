@@ -22,14 +22,14 @@ def is_undulation(metres: float) -> bool:
 
 
 def zeros_words(metres: float) -> str:
-    """What probably stands behind a constant difference of heights."""
+    """Say what probably causes a constant difference of heights."""
     if is_undulation(metres):
         return "most likely one counts from the ellipsoid (GNSS, RTK), the other from the geoid (sea level)"
     return "they count from another zero (take-off point, ellipsoid, sea level)"
 
 
 def height_remedy(metres: float, other: str) -> str:
-    """How to bring the block to the heights of something else, which lie so many metres above its own."""
+    """Say how to bring the block to the heights of something else, which lie so many metres above its own."""
     exactly = (
         ", or name both (--crs EPSG:32633+5773, block.heights) where PROJ has the geoid"
         if is_undulation(metres)
@@ -39,8 +39,8 @@ def height_remedy(metres: float, other: str) -> str:
 
 
 def shift_to_control_m(group: GroupResult) -> float | None:
-    """How far heights of the positions of a group lie above those of its control points, where control points hold it,
-    all flights are off by nearly the same, and neither sideways; None otherwise."""
+    """Return how far heights of the positions of a group lie above those of its control points, metres, where control
+    points hold it, all flights are off by nearly the same, and neither sideways; None otherwise."""
     if group.control is None or not group.control.used or not group.flights:
         return None
     stated_m = np.zeros(3) if group.positions is None else np.array(group.positions.stated_m)
@@ -53,8 +53,8 @@ def shift_to_control_m(group: GroupResult) -> float | None:
 
 
 def shift_of_points_m(errors_m: Sequence[Sequence[float]], sigmas_m: Sequence[float]) -> float | None:
-    """How far a block lies above surveyed points, where their heights differ by nearly the same, and no more sideways
-    than is expected; None otherwise. errors_m: (N, 3) block less survey; sigmas_m: (3,) of one point."""
+    """Return how far a block lies above surveyed points, metres, where their heights differ by nearly the same, and no
+    more sideways than is expected; None otherwise. errors_m: (N, 3) block less survey; sigmas_m: (3,) of one point."""
     errors, limits_m = np.array(errors_m).reshape(-1, 3), np.maximum(_ALIKE_M, _ALIKE_SIGMAS * np.array(sigmas_m))
     if len(errors) < 2:
         return None

@@ -56,7 +56,7 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What was given of a block, as observations.
+    """Holds what was given of a block, as observations.
 
     poses: image_id -> pose whose centre is one, with its standard deviations. focal_sigmas: camera_id -> standard
     deviation of its focal length, as a share of it. angles: image_id -> attitude as it was given, of which the tilt
@@ -137,7 +137,8 @@ def adjust_block(
 
 
 def _joined(archives: Sequence[Mapping[str, Any]], kinds: Sequence[str], block: Block) -> AdjustedBlock:
-    """All groups as one block; a camera that several have is that of the largest. kinds: how each was placed."""
+    """Join all groups to one block; a camera that several groups share is that of the largest group. kinds: how each
+    was placed."""
     image_ids, camera_ids = _image_ids(block), sorted(block.cameras)
     cameras = dict(block.cameras)
     poses: dict[str, AdjustedPose] = {}
@@ -167,7 +168,7 @@ def _joined(archives: Sequence[Mapping[str, Any]], kinds: Sequence[str], block: 
 
 
 def _image_ids(block: Block) -> list[str]:
-    """In the order of their numbers in the database."""
+    """Return the image ids in the order of their numbers in the database."""
     return sorted(image.image_id for image in block.images)
 
 
@@ -203,7 +204,8 @@ def _task(contents: ExportContents, observed: Observed) -> Iterator[Path]:
 
 
 def _camera_task(block: Block, camera_id: str, observed: Observed) -> dict[str, Any]:
-    """What a process knows of a camera: its prior, which unknowns are free, and what mapping starts from."""
+    """Return what a process needs to know of a camera: its prior, which unknowns are free, and what mapping starts
+    from."""
     stated = observed.cameras.get(camera_id, block.cameras[camera_id])
     prior = lens_prior(stated, observed.focal_sigmas[camera_id])
     images = sum(image.camera_id == camera_id for image in block.images)
@@ -220,7 +222,7 @@ def _camera_task(block: Block, camera_id: str, observed: Observed) -> dict[str, 
 
 
 def _solved(folder: Path, process: str, task: Mapping[str, Any], what: str) -> list[dict[str, Any]]:
-    """What a process of its own says of the models that it makes in `folder`. InputError where it stops."""
+    """Return what a process of its own says of the models that it makes in `folder`. InputError where it stops."""
     path = folder / "task.json"
     path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | task), encoding="utf-8")
     result = run_process(process, folder, "result.json", what)

@@ -64,7 +64,7 @@ _FAR_SIGMAS, _NEAR_SHARE = 10.0, 0.05
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What was given of N images: rows are their numbers less one.
+    """Holds what was given of N images; rows are the images' numbers less one.
 
     positions_m, sigmas_m: (N, 3), NaN where there is none. ups: (N, 3) unit vectors upwards in the camera's frame by
     its measured tilt. rotations: (N, 3, 3) cam_from_world, sigmas_deg: (N,) of its angles. flights: (N,) from 0.
@@ -81,7 +81,7 @@ class Given:
 
     @classmethod
     def of_file(cls, arrays: Mapping[str, Any]) -> Given:
-        """Of priors.npz, see `mapping`."""
+        """Read the arrays of priors.npz, see `mapping`."""
         return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
 
     @property
@@ -90,14 +90,14 @@ class Given:
         return np.asarray(np.sqrt((self.sigmas_m**2).mean(axis=1)))
 
     def without_positions(self) -> Given:
-        """In a frame of its own: given positions are no observations there."""
+        """Return what was given for a group in a frame of its own, where given positions are no observations."""
         unknown = np.full_like(self.positions_m, np.nan)
         return replace(self, positions_m=unknown, sigmas_m=unknown)
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What all adjustments of a process share.
+    """Holds what all adjustments of a process share.
 
     priors, sigmas: by camera number (12,) as in `network.LENS`, sigmas zero where an unknown is held; fisheyes: numbers
     of such cameras. options: of the adjustment. lenses: what adjustments have found, by camera number. held_sigmas: of
@@ -346,7 +346,8 @@ def state_errors(work: Work, model: Any, given: Given) -> float:
 
 
 def _write_errors(model: Any, network: Network, state: Unknowns, points: Sequence[int]) -> float:
-    """The same of the network of a model. Points behind a camera have errors as large as a number can be."""
+    """Write the mean reprojection error of every point, pixels, into a model; return that of all image points of its
+    network. Points behind a camera have errors of BEHIND_PX."""
     apart_px = np.linalg.norm(project(network, state) - network.xy_px, axis=1)
     apart_px = np.where(np.isfinite(apart_px), apart_px, BEHIND_PX)
     counts = np.bincount(network.point, minlength=len(points))
@@ -389,7 +390,7 @@ def _placed(
 
 
 def images_by_camera(model: Any) -> Counter[int]:
-    """How many posed images each camera of a model has."""
+    """Count the posed images of each camera of a model."""
     return Counter(int(image.camera_id) for image in model.images.values() if image.has_pose)
 
 

@@ -1,4 +1,4 @@
-"""What a pycolmap model holds, as arrays for the process that asked for it: poses, points and tracks.
+"""This module turns a pycolmap model into arrays for the process that asked for it: poses, points and tracks.
 
 Image numbers are those of the database, from 1.
 """
@@ -31,7 +31,8 @@ def points_of(model: Any) -> FloatArray:
 
 
 def arrays(model: Any, lenses: Mapping[int, FloatArray]) -> dict[str, Any]:
-    """What the parent reads: see `mapping.Model`. lenses: (12,) values by camera number, of those that have images."""
+    """Return the arrays of a model that the parent process reads: see `mapping.Model`. lenses: (12,) values by camera
+    number, of those that have images."""
     ids, point_ids = image_numbers(model), sorted(model.points3D)
     points = [model.points3D[i] for i in point_ids]
     cameras = sorted(lenses)
@@ -47,7 +48,7 @@ def arrays(model: Any, lenses: Mapping[int, FloatArray]) -> dict[str, Any]:
 
 
 def tracks_of(model: Any) -> dict[str, Any]:
-    """Which keypoints see the points: (M,) image numbers, keypoints of these, and rows of `points_m`."""
+    """Return which keypoints see the points: (M,) image numbers, keypoints of these images, and rows of `points_m`."""
     images, keypoints, rows = [], [], []
     for row, number in enumerate(sorted(model.points3D)):
         elements = model.points3D[number].track.elements

@@ -1,4 +1,4 @@
-"""Which verified matches contradict the adjusted block.
+"""Outlier rejection finds verified matches that contradict the adjusted block.
 
 Repeated patterns (facades, roof tiles, rows of plants) pass every test of two views when the repetition runs along the
 epipolar lines, or the geometry of the pair was itself estimated from such matches. The adjusted block knows better: it
@@ -53,7 +53,7 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Contradictions:
-    """What contradicts the block.
+    """Holds what contradicts the block.
 
     masks: of every pair, which matches (M,) do. doubtful: image ids whose adjusted poses too many of their matches
     contradict: there the block is wrong, and none of their matches counts as contradicting. expected_right: the share
@@ -84,7 +84,7 @@ def contradicting(
     pairs: Sequence[MatchedKeypoints],
     limits: Limits,
 ) -> Contradictions:
-    """Which matches contradict the block; none in pairs of images that it does not hold together.
+    """Find the matches that contradict the block; none in pairs of images that it does not hold together.
 
     cameras: image_id -> adjusted camera. A match contradicts the block where it lies beside the epipolar line, where
     its rays meet behind a camera, or where more of the keypoints that its two keypoints are matched with in third
@@ -116,7 +116,7 @@ def contradicting(
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """What contradicts the block by distances alone, once images in wrong places are left out.
+    """Holds what contradicts the block by distances alone, once images in wrong places are left out.
 
     view: the block's rays. masks: of every pair, which matches (M,) contradict the block, None where it is not judged.
     """
@@ -160,8 +160,8 @@ class Settled:
         return masks, known
 
     def evidence(self) -> list[MatchEvidence | None]:
-        """Of every pair, what tells how probable the matches that do not contradict the block are, by each other alone;
-        None where there are none."""
+        """Return, for every pair, what tells how probable those of its matches are that do not contradict the block, by
+        each other alone; None where there are none."""
         kept = [
             None
             if mask is None or mask.all()
@@ -183,7 +183,8 @@ def _images(pairs: Sequence[MatchedKeypoints]) -> set[str]:
 def _masks(
     view: _Rays, pairs: Sequence[MatchedKeypoints], limits: Limits, group: Mapping[str, int]
 ) -> list[BoolArray | None]:
-    """Of every pair, which matches contradict the block; None where it is not judged. group: of the images that are."""
+    """Return, for every pair, which matches (M,) contradict the block; None where it is not judged. group: of the
+    images that are."""
     held = [p.image_id0 in group and group[p.image_id0] == group.get(p.image_id1) for p in pairs]
     ends = [view.keypoints_of(pair) if judged else None for pair, judged in zip(pairs, held, strict=True)]
     ties = _Ties.of(len(view.rays), [both for both in ends if both is not None])
@@ -215,8 +216,8 @@ def _groups(block: AdjustedBlock) -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """All keypoints of the block in one row. rays: (K, 3) in the world; image: (K,) rows of centers_m (N, 3) and
-    focal_px (N,). first: image_id -> its first keypoint."""
+    """Holds the rays of all keypoints of the block in one row. rays: (K, 3) in the world; image: (K,) rows of centers_m
+    (N, 3) and focal_px (N,). first: image_id -> its first keypoint."""
 
     rays: FloatArray
     image: IntArray
@@ -255,7 +256,7 @@ class _Rays:
 
 @dataclass(frozen=True, eq=False)
 class _Ties:
-    """Which keypoints each keypoint is matched with: those from start[k] to start[k + 1]."""
+    """Lists the keypoints that each keypoint is matched with: those from start[k] to start[k + 1]."""
 
     start: IntArray
     others: IntArray
@@ -278,7 +279,7 @@ class _Ties:
 
 @dataclass(frozen=True, eq=False)
 class _Meeting:
-    """Where the rays of matches (M,) of one pair meet.
+    """Describes where the rays of matches (M,) of one pair meet.
 
     error_px, depth_m (along rays0), angle_rad: (M,). points_m, shifted_m: (M, 3) the points, and as far along rays0 as
     the error of a keypoint may put them.
@@ -327,7 +328,7 @@ class _Meeting:
 
 
 def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: Limits) -> BoolArray:
-    """Which matches (M,) of one pair contradict the block."""
+    """Return which matches (M,) of one pair contradict the block."""
     if not len(ends0):
         return np.zeros(0, dtype=bool)
     meeting = _Meeting.of(view, ends0, ends1)

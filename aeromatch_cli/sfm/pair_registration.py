@@ -56,7 +56,8 @@ def tied_by_pairs(
 
 
 def _best_tie(pairs: Sequence[PairPoints], poses: Mapping[str, Pose], given: Mapping[str, Pose]) -> PairPoints | None:
-    """Of pairs with most matches first: the first of a known and another image, the last by name of several alike."""
+    """Return the first pair of a known and another image, pairs with most matches first; the last by name of several
+    alike."""
     best: PairPoints | None = None
     for pair in pairs:
         if best is not None and len(pair.indices) < len(best.indices):

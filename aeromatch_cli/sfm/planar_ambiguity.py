@@ -151,7 +151,7 @@ class _Other:
 
     @classmethod
     def of(cls, pycolmap: ModuleType, model: Any, number: int) -> _Other | None:
-        """None where an image has no other pose that its points lead to."""
+        """Return the other pose of an image, None where its points lead to no other pose."""
         image, (pixels, points_m) = model.images[number], _observed(model, number)
         if len(pixels) < MIN_OBSERVATIONS:  # weak images leave the model in any case
             return None

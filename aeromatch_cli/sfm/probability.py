@@ -1,4 +1,5 @@
-"""How probable it is that a verified match is right, by what the adjusted block and its neighbours say of it.
+"""This module states how probable it is that a verified match is right, from the adjusted block and the match's
+neighbours.
 
 A logistic model of a few properties that every match has. It was fitted on rendered blocks, whose truth is exact;
 `scripts/bench probability` fits it again and draws how far it can be relied on, on blocks that it has not seen.
@@ -32,7 +33,7 @@ WEIGHTS = (4.818, 2.247, 1.148, -0.732, -1.268, -3.094)
 
 @dataclass(frozen=True, eq=False)
 class MatchEvidence:
-    """What is known of the matches of a pair, (M,) each, one at least.
+    """Holds what is known of the matches of a pair, (M,) each, one at least.
 
     scores: the matcher's, 0-1. error_px: distance from the epipolar line of the adjusted block. confirming: in how many
     third images their keypoints are matched within a pixel of the point's place. off0_px, off1_px: how far the match

@@ -36,7 +36,7 @@ def run_process(module: str, folder: Path, result: str, what: str) -> Path:
 
 
 def quiet_pycolmap() -> ModuleType:
-    """For the child: pycolmap without its log."""
+    """Import pycolmap without its log, in the child process."""
     zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
     import pycolmap
 

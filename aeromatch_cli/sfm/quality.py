@@ -124,7 +124,7 @@ class Quality:
 
 
 class QualityInput(Record):
-    """What a block is judged by.
+    """Holds what a block is judged by.
 
     images: of the block. adjust, orient: results of these stages. components: sizes of the groups of images that
     verified pairs connect, the largest first. refined: whether tie points were measured by least squares. contradicted:
@@ -262,7 +262,8 @@ def _frames(evidence: QualityInput) -> _Found:
 
 
 def _positions_given(evidence: QualityInput) -> int:
-    """Of how many images; the adjustment knows of none that the orientation has left out."""
+    """Count the images with a given position, those that the orientation has left out as well, of which the adjustment
+    does not know."""
     return max(evidence.adjust.positions_given, evidence.orient.positions_given if evidence.orient else 0)
 
 
@@ -615,7 +616,7 @@ def _affinity(camera_id: str, parameters: Mapping[str, Parameter], affinity: Map
 
 
 def _held_words(evidence: QualityInput) -> str:
-    """Which settings hold which parameters of the cameras, "" where none does."""
+    """Say which settings hold which parameters of the cameras, "" where none does."""
     by_setting: dict[str, list[str]] = {}
     for name, setting in evidence.held.items():
         by_setting.setdefault(setting, []).append(name)
@@ -681,7 +682,7 @@ def _stated(parameters: Mapping[str, Parameter]) -> set[str]:
 
 
 def _deformation(evidence: QualityInput) -> _Found:
-    """Of the group that is worst in each respect."""
+    """Judge the deformation of the group that is worst in each respect."""
     known = [(group, group.heights) for group in evidence.groups if group.heights]
     if not known:
         yield "expected deformation: the block was not adjusted, or has too few points"
@@ -728,7 +729,7 @@ def _tilt_deg(group: GroupResult) -> float:
 
 
 def _kept_poses(evidence: QualityInput) -> _Found:
-    """Of poses that were kept as they were given, whether they explain the matches."""
+    """Judge whether poses that were kept as they were given explain the matches."""
     orient = evidence.orient
     if orient is None or not orient.stays or not orient.images_matched:
         return

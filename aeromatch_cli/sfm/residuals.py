@@ -68,7 +68,7 @@ def _residual(
 
 
 def residual_figures(residuals: Mapping[str, PoseResidual], names: Mapping[str, str]) -> PoseResiduals:
-    """What all images together show. names: of the files, by image_id. The worst image is that with the longest
+    """Summarise the residuals of all images. names: of the files, by image_id. The worst image is that with the longest
     residual."""
     figures: dict[str, Any] = {"images": len(residuals)}
     for key in ("position_m", "position_sigmas", "rotation_deg", "rotation_sigmas"):

@@ -1,4 +1,4 @@
-"""Which images of a block look alike: image retrieval from their own descriptors.
+"""Image retrieval finds which images of a block look alike, from their own descriptors.
 
 Source: pycolmap's visual index, a vocabulary of the block's descriptors with inverted lists and Hamming embedding
 (Schoenberger et al. 2016, A vote-and-verify strategy for fast spatial verification in image retrieval). The vocabulary

@@ -79,7 +79,7 @@ class FirstPassMatches:
 
     @property
     def cameras(self) -> dict[str, Camera]:
-        """By image_id."""
+        """Return the cameras by image_id."""
         return {image.image_id: self.block.camera(image) for image in self.block.images}
 
     @property
@@ -136,7 +136,7 @@ def from_given(evidence: FirstPassMatches, good: set[str], *, correct: bool) -> 
 
 
 def unoriented_remark(evidence: FirstPassMatches) -> str:
-    """Why no image could be oriented from its matches."""
+    """Say why no image could be oriented from its matches."""
     said = "no image could be oriented from the pictures"
     if len(evidence.block.images) < 2:
         return f"{said}: one image has none to be compared with"
@@ -165,7 +165,7 @@ def judged(given: Solution, pictures: Solution) -> Solution:
 
 
 def _kept_remarks(given: Solution, pictures: Solution) -> list[str]:
-    """How far given poses, which stay, are from those of the pictures."""
+    """Say how far given poses, which stay, are from those of the images."""
     oriented = {i for group in pictures.groups for i in group.images}
     found = {i: pictures.poses[i] for i in sorted(oriented & pictures.poses.keys())}
     off_deg = list(attitude_errors_deg(given.poses, found).values())
@@ -268,7 +268,7 @@ def _same_lens(found: Camera | None, old: Camera) -> bool:
 
 
 def _convention(models: Sequence[Model], angles: Mapping[str, Angles], given: Mapping[str, Pose]) -> Recognised | None:
-    """By the models that positions have placed."""
+    """Recognise the reading of the angles by the models that positions have placed."""
     placed = [model for model in models if model.kind == "positions"]
     north_deg = [_north_sigma_deg(model, given) for model in placed]
     # Only the models that know north about as well as the best one: a short strip knows little of it.

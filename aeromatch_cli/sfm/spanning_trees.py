@@ -20,7 +20,7 @@ class Trees:
 
 
 def trees_of(keypoints: int, ends: IntArray, scores: FloatArray) -> Trees:
-    """Of matches (M, 2) between keypoints that are numbered through, and their scores (M,).
+    """Return the trees of matches (M, 2) between keypoints that are numbered through, with the matches' scores (M,).
 
     The keypoint of a point with most matches is its first one; each other is measured by the nearest to that, by the
     match with the best score. The result does not depend on the order of the matches.

@@ -1,4 +1,4 @@
-"""What is left of an adjusted block's points once matches are dropped."""
+"""Track pruning keeps the points of an adjusted block that are left once matches are dropped."""
 
 from __future__ import annotations
 

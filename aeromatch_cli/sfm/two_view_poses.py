@@ -45,7 +45,7 @@ def block_of_pair(
     rotation: FloatArray,
     attitude0: FloatArray | None,
 ) -> AdjustedBlock:
-    """Both images, a unit apart, with one point that ties them.
+    """Return a block of both images, a unit apart, with one point that ties them.
 
     points_px: (M, 2) of the verified matches in either image. essential: E (3, 3), x1^T E x0 = 0 on normalised rays.
     rotation: (3, 3) cam1_from_cam0. attitude0: (3, 3) cam_from_world of the first image as far as it is known: heights
@@ -72,7 +72,7 @@ def block_of_pair(
 
 
 def _in_front(rays0: FloatArray, rays1: FloatArray, translation: FloatArray) -> int:
-    """How many points lie in front of both cameras: rays (M, 3) of both in the frame of the second."""
+    """Count the points that lie in front of both cameras: rays (M, 3) of both in the frame of the second."""
     # x1 = depth1 rays1 = depth0 rays0 + translation; crossed with rays1 and with rays0.
     normal = np.cross(rays0, rays1)
     depth0 = -(np.cross(translation, rays1) * normal).sum(axis=1)

@@ -84,7 +84,7 @@ def run(context: Context) -> StageReport:
 
 
 def adjusted_block(context: Context) -> AdjustedBlock | None:
-    """What is on file for the present results; None without orientation, or where no image could be adjusted."""
+    """Read the adjusted block of the present results; None without orientation, or where no image could be adjusted."""
     if not _is_current(context, _groups(context)):
         return None
     found = read_adjusted(context.workspace.adjusted)
@@ -111,7 +111,7 @@ def _is_current(context: Context, groups: Sequence[Group]) -> bool:
 
 
 def current_fingerprint(context: Context) -> str:
-    """Of the adjustment of the present results."""
+    """Return the fingerprint that the adjustment of the present results must carry."""
     return _fingerprint(context, orient.groups(context))
 
 
@@ -191,7 +191,7 @@ def _held_by(context: Context) -> dict[str, str]:
 
 
 def readout_not_tried(context: Context, oriented: Collection[str]) -> str | None:
-    """Why the read-out time of a rolling shutter was no unknown, None where it was tried. oriented: image_ids."""
+    """Say why the read-out time of a rolling shutter was no unknown, None where it was tried. oriented: image_ids."""
     if context.settings.keeps_poses:
         return "orient=given"
     if not context.settings.adjust.rolling_shutter:
@@ -214,7 +214,7 @@ def _remarks(
     groups: Sequence[GroupResult],
     control: Control | None,
 ) -> list[str]:
-    """What a person should know of the adjusted block, one sentence each."""
+    """Say what a person should know of the adjusted block, one sentence each."""
     if not adjusted.poses:
         words = "no image could be oriented from the verified matches: export/colmap/sparse has no points"
         kept = context.settings.keeps_poses
@@ -234,7 +234,7 @@ def _remarks(
 
 
 def height_remarks(groups: Sequence[GroupResult]) -> list[str]:
-    """What is said of heights of positions that lie above or below those of the control points, all by as much."""
+    """Say which heights of positions lie above or below those of the control points, all by as much."""
     shifts_m = [up_m for group in groups if (up_m := shift_to_control_m(group)) is not None]
     return [
         f"heights of the given positions lie {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} those of the control "
@@ -244,7 +244,7 @@ def height_remarks(groups: Sequence[GroupResult]) -> list[str]:
 
 
 def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[str]:
-    """What is said of control points that lie far from where the given positions of the images put them."""
+    """Say which control points lie far from where the given positions of the images put them."""
     if offset_m is None or context.block.crs == LOCAL:
         return []
     east_m, north_m, up_m = offset_m
@@ -283,7 +283,7 @@ def _control_figures(context: Context, adjusted: AdjustedBlock, points: Sequence
 
 
 def _counted_from_below(context: Context, adjusted: AdjustedBlock, control: Control) -> list[str]:
-    """What is said of image points of surveyed points whose y counts from the lower edge of the picture."""
+    """Say that the y of image points of surveyed points counts from the lower edge of the picture, where it does."""
     images = context.image_by_id
     turned = [
         replace(point, pixels={i: np.array([x, images[i].height_px - 1.0 - y]) for i, (x, y) in point.pixels.items()})

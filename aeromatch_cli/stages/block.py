@@ -1,4 +1,5 @@
-"""From settings to a `Block` as it is given: inputs read in parallel, stated ground, what was fixed before kept.
+"""This module turns settings into a `Block` as it is given: inputs read in parallel, stated ground, what was fixed
+before kept.
 
 The world origin and the common ground sampling distance are fixed when a workspace is made, as image ids are: images
 that come later must not change the views of all others. The latter is fixed anew when it would now come out clearly
@@ -176,7 +177,7 @@ def _check_folders(settings: Settings, workspace: Workspace) -> None:
 
 
 def _mask_warnings(settings: Settings, images: Sequence[Image]) -> list[str]:
-    """What is wrong with the masks. Raises as `mask_path`."""
+    """Say what is wrong with the masks. Raises as `mask_path`."""
     masks = settings.block.masks
     found = [mask_path(masks, image.name) for image in images]
     if not masks or any(found):
@@ -259,7 +260,7 @@ def _same_crs(given: str, known: str) -> bool:
 
 
 def _read_header(picture: Path | RemoteFile) -> tuple[ExifFacts | str, str]:
-    """What a picture's header says, or why it is unusable, and the fingerprint of the file."""
+    """Return what an image's header says, or why it is unusable, and the fingerprint of the file."""
     path = on_disk(picture)
     try:
         return exif_or_reason(path), picture_fingerprint(path)

@@ -65,14 +65,14 @@ def keypoints_of(step: Any, settings: Settings) -> int:
 
 
 def _reduction(settings: Settings, kind: type[Described]) -> dict[str, float]:
-    """As the user's own keypoints of the kind have it; of others that they are never reduced, where that is set."""
+    """Return the reduction that the user's keypoints of the kind have; others are never reduced where that is set."""
     own = settings.extract
     taken = isinstance(own, Described) and (isinstance(own, kind) or own.pixels_per_keypoint == 0.0)
     return {"pixels_per_keypoint": own.pixels_per_keypoint} if taken else {}
 
 
 def _views(settings: Settings) -> NeighbourViews:
-    """Of steps with features of their own: with distant ground where the settings have it."""
+    """Return the views of steps with features of their own: with distant ground where the settings have it."""
     own = settings.simulate
     return NeighbourViews(far_ground=own.far_ground) if isinstance(own, PlaneViews) else NeighbourViews()
 
@@ -122,7 +122,7 @@ class StepContext:
 
     @cached_property
     def images(self) -> frozenset[str]:
-        """Those that the step looks at: all in the first, else those of its pairs."""
+        """Return the images that the step looks at: all in the first step, else those of its pairs."""
         if self.name == FIRST:
             return frozenset(image.image_id for image in self.context.block.images)
         return frozenset(image_id for key in self.reasons for image_id in key)
@@ -190,7 +190,7 @@ def _tried(left: Mapping[Key, str], found: Mapping[Key, PairStatistics]) -> dict
 
 
 def _untied(left: Mapping[Key, str], enough: Iterable[Key]) -> dict[Key, str]:
-    """Those of the pairs left whose images no third image ties: none has pairs with both that have enough."""
+    """Return the pairs whose images no third image ties: none has pairs with both that have enough matches."""
     settled: dict[str, set[str]] = {}
     for id0, id1 in enough:
         settled.setdefault(id0, set()).add(id1)
@@ -199,7 +199,8 @@ def _untied(left: Mapping[Key, str], enough: Iterable[Key]) -> dict[Key, str]:
 
 
 def makers(settings: Settings, workspace: Workspace) -> list[Workspace]:
-    """Where views and features are made: the workspace itself, or a cascade's first step and those with their own."""
+    """Return the workspaces in which views and features are made: the workspace itself, or a cascade's first step and
+    those with their own."""
     if not settings.cascade:
         return [workspace]
     names = FIRST, *(recipe.name for recipe in settings.cascade if recipe.own_features)
@@ -237,7 +238,7 @@ def _step(context: Context, name: str, features_of: str, settings: Settings, rea
 
 
 def evidence_of(steps: Sequence[StepContext]) -> dict[Key, PairStatistics]:
-    """What the steps have found together of those of the pairs that the last of their steps has judged."""
+    """Return, by pair, what the steps have found together, for the pairs that the last of their steps has judged."""
     judged = [_InOrder(filter.verified_pairs(step.context)) for step in steps]
     readers = [_keypoint_reader(step) for step in steps]
     found = {}
@@ -269,7 +270,7 @@ class _InOrder:
         self._next = next(self._rest, None)
 
     def of(self, key: Key) -> VerifiedEntry | None:
-        """None where the step has not judged the pair."""
+        """Return the verified entry of a pair, None where the step has not judged it."""
         if self._next is None or (self._next[0].image_id0, self._next[0].image_id1) != key:
             return None
         entry, self._next = self._next[1], next(self._rest, None)
@@ -305,8 +306,8 @@ def _evidence(
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of a pair: the step after which it needed nothing more, or ""; what it lacks in the end; verified matches of all
-    steps, those that two of them have found counted once."""
+    """Holds what became of a pair: the step after which it needed nothing more, or ""; what it lacks in the end; and
+    the verified matches of all steps, those that two of them have found counted once."""
 
     settled_by: str
     lacks: str
@@ -314,7 +315,7 @@ class Outcome:
 
 
 def outcomes(context: Context, steps: Sequence[StepContext]) -> dict[Key, Outcome]:
-    """Of every pair. One that took a step though it lacked nothing is settled by one before it."""
+    """Return the outcome of every pair. One that took a step though it lacked nothing is settled by one before it."""
     found, last = evidence_of(steps), context.settings.cascade[-1]
     answer: dict[Key, Outcome] = {}
     for pair in context.pairs:

@@ -123,7 +123,7 @@ def _try_pair(trial: _PairTrial) -> _Tried:
 
 
 def _match(trial: _PairTrial) -> tuple[int, tuple[FloatArray, FloatArray]]:
-    """How many matches there are before they are judged, and the places of those that are left."""
+    """Return how many matches there are before they are judged, and the places of those that are left."""
     matches = compared(trial.matcher, trial.features, trial.pair.geometry, trial.sources)
     sides = [(features.keypoints_px, features.colours) for features in trial.features]
     judged = candidates(matches, *sides)
@@ -279,7 +279,8 @@ def _sample(context: Context) -> list[Pair]:
 
 
 def _pixels(trial: _Trial) -> int:
-    """What an image is worked on as: its own pixels, reduced as the settings ask, or those of all its views."""
+    """Return the number of pixels that an image is worked on with: its own, reduced as the settings ask, or those of
+    all its views."""
     views = simulate.views_of(trial.task.views)
     enhancing = trial.task.views.enhance
     if enhancing.enhancer.keep_source and not enhancing.skipped:
@@ -341,8 +342,8 @@ def _estimate(
 
 
 def _disk_bytes(context: Context, keypoints: float, descriptors: float, matches: float) -> float:
-    """Of the finished workspace without the first pass. keypoints, descriptors: of all images; matches: of all pairs,
-    before verification."""
+    """Estimate the size of the finished workspace without the first pass, bytes. keypoints, descriptors: of all images;
+    matches: of all pairs, before verification."""
     settings = context.settings
     total = descriptors * _BYTES_PER_DESCRIPTOR + matches * _BYTES_PER_MATCH * (2 if settings.cascade else 1)
     total += matches * _BYTES_PER_EXPORTED * len(settings.export)

@@ -129,7 +129,7 @@ def _matched(
 
 
 def _connection_left(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> FilterResult:
-    """What is left of the verified entries, and how it connects the images."""
+    """Return what is left of the verified entries, and how it connects the images."""
     final = FinalEntries(context.workspace)
     left = [(pair, final.left(pair.image_id0, entry)) for pair, entry in entries]
     judged = ((p.image_id0, p.image_id1, after.verdict.state, len(after.matches.indices)) for p, after in left)
@@ -153,7 +153,7 @@ def _whole(workspace: Workspace, result: ConsistencyResult) -> bool:
 
 
 def _left_of(context: Context, adjusted: AdjustedBlock, entries: Iterable[tuple[Pair, VerifiedEntry]]) -> AdjustedBlock:
-    """What final matches hold of a block. entries: all verified ones."""
+    """Return what final matches hold of a block. entries: all verified ones."""
     final = FinalEntries(context.workspace)
     pairs = (
         (pair.image_id0, pair.image_id1, entry.matches.indices, final.kept(pair.image_id0, entry))
@@ -202,7 +202,7 @@ def final_pairs(context: Context, features: Callable[[str], str] | None = None) 
 
 
 class FinalEntries:
-    """What is left of verified entries, by what a workspace has on file; all, where that is of other results.
+    """Gives what is left of verified entries, by what a workspace has on file; all, where that is of other results.
 
     Raises WorkspaceError for an entry whose features were made again since.
     """
@@ -232,7 +232,7 @@ class FinalEntries:
         return self.left(image_id0, entry)
 
     def left(self, image_id0: str, entry: VerifiedEntry) -> VerifiedEntry:
-        """The same of an entry whose matches are known to be of the present features."""
+        """Return what is left of an entry whose matches are known to be of the present features."""
         if (keep := self._not_dropped(image_id0, entry)) is None:
             return entry
         left, verdict = select(entry.matches, keep), entry.verdict

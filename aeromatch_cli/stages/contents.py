@@ -1,4 +1,4 @@
-"""What leaves the workspace: keypoints and verified matches of the pairs that are up to date."""
+"""This module gathers what leaves the workspace: keypoints and verified matches of the pairs that are up to date."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def contents_of(
     *,
     raw: bool = True,
 ) -> ExportContents:
-    """What exporters and mappers get. Read lazily: one row and one image's keypoints at a time.
+    """Return what exporters and mappers get. Read lazily: one row and one image's keypoints at a time.
 
     adjusted: keypoints are those that its poses see, without what a rolling shutter has moved. verified: where the
     verified matches come from. raw: whether the matches before verification are wanted; else the verified ones stand

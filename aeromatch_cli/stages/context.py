@@ -1,4 +1,4 @@
-"""What every stage knows: settings, workspace, block, pairs, and what follows from them."""
+"""The context holds what every stage knows: settings, workspace, block, pairs, and what follows from them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ _GUESS = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Union:
-    """What the features of every image and the matches of every pair of a cascade must carry: fingerprints, by id."""
+    """Holds the fingerprints that the features of every image and the matches of every pair of a cascade must carry, by
+    id."""
 
     features: Mapping[str, str]
     matches: Mapping[tuple[str, str], str]
@@ -40,12 +41,33 @@ class Union:
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
+    """Holds everything that a stage needs to know. It is made once per command by `stages.pairs.prepare`.
 
-    given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
-    share of it, as it was stated. calibrated: cameras that the first pass has found. likely_focals: camera_id -> focal
-    length in pixels that EXIF speaks for, where it contradicts the given one. angles: image_id -> attitude as it was
-    given. flights, velocities: as in `sfm.mapping.Observed`. control: surveyed points.
+    settings: the resolved settings. workspace: the paths of the workspace's files. executor: runs the tasks of stages.
+    block: images, cameras, poses and ground in the world frame, oriented once `stages.orient` has run.
+    pairs: the pairs of pairs.csv, in its order.
+    image_fingerprints: image_id -> fingerprint of the image file.
+    given: the block before it was oriented.
+    focal_sigmas: camera_id -> standard deviation of its focal length as it was stated, as a share of it.
+    calibrated: camera_ids whose focal length the first pass has found.
+    likely_focals: camera_id -> focal length in pixels that EXIF supports, where it contradicts the given one.
+    angles: image_id -> attitude as it was given.
+    flights: image_id -> name of its flight.
+    velocities: image_id -> (3,) velocity of the aircraft in the world frame, m/s, where it is known.
+    control: surveyed points.
+    remote: name of an image -> where it lies on another machine; empty where the images lie in a folder.
+    chosen: the pairs (image_id0, image_id1) that a step of a cascade works on; None for all.
+    searched_by: the matcher that made the matches which a step of a cascade continues from; None without such a step.
+    union: the fingerprints of features and matches that the steps of a cascade have made together; None without one.
+    part: a prefix to the names of stages where progress is shown.
+    shard: the part of the block that this command works on; None for all.
+    overwrite: whether results that are up to date are made again.
+    known_fingerprints: caches (image_id, needs) -> fingerprint of the image's geometry.
+    known_tasks: caches image_id -> task of the stage extract.
+    known_pairs: caches (kind, image_id0, image_id1) -> fingerprint that matches and verdicts of a pair must carry.
+
+    The caches are filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were
+    made from.
     """
 
     settings: Settings
@@ -62,27 +84,20 @@ class Context:
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
-    # By name; none where the images lie in a folder.
     remote: Mapping[str, RemoteFile] = field(default_factory=dict)
-    # The pairs that are worked on, of a step of a cascade; None: all.
     chosen: frozenset[tuple[str, str]] | None = None
-    # What has made the matches that a step of a cascade goes on from; None where it does not.
     searched_by: Matcher | None = None
-    # Fingerprints of features and matches that steps of a cascade have made together; None without a cascade.
     union: Union | None = None
-    # Stands before the names of stages in what is shown of progress.
     part: str = ""
     shard: Shard | None = None
     overwrite: bool = False
-    # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
     known_fingerprints: dict[tuple[str, frozenset[str]], str] = field(default_factory=dict, init=False, repr=False)
     known_tasks: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
-    # What matches and verdicts of a pair must carry, by what is asked for and the pair.
     known_pairs: dict[tuple[str, str, str], str] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def observed(self) -> Observed:
-        """What was given, for mapping and adjustment."""
+        """Return what was given, as observations for mapping and adjustment."""
         adjust = self.settings.adjust
         switches: dict[str, bool] = {**dict.fromkeys(adjust.free, True), **dict.fromkeys(adjust.hold, False)}
         return Observed(
@@ -129,11 +144,11 @@ class Context:
         return rows
 
     def picture(self, image: Image) -> Path | RemoteFile:
-        """Where an image lies, here or elsewhere."""
+        """Return where an image lies, here or elsewhere."""
         return self.remote.get(image.name) or Path(self.settings.block.images) / image.name
 
     def image_path(self, image: Image) -> Path:
-        """Its file on this machine. Raises ItemError where it cannot be fetched."""
+        """Return the file of an image on this machine. Raises ItemError where it cannot be fetched."""
         return on_disk(self.picture(image))
 
     def pose(self, image_id: str) -> Pose | None:
@@ -144,7 +159,7 @@ class Context:
         return _ground_heights(self.block).get(image_id)
 
     def ground_remark(self, image_id: str) -> str:
-        """Why the ground of an image is not the terrain below it, else ""."""
+        """Say why the ground of an image is not the terrain below it, else return ""."""
         footprint = block_footprints(self.block).get(image_id)
         if footprint is None or footprint.degenerate is None:
             return ""
@@ -179,7 +194,8 @@ class Context:
         return any(pose is None or pose.world_rotation is None for pose in poses)
 
     def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
-        """Where else the ground of an image is looked at from: the images it is paired with that have an attitude."""
+        """Return from where else the ground of an image is looked at: the images it is paired with that have an
+        attitude."""
         found = []
         for other_id, overlap in self._paired.get(image_id, ()):
             pose = self.pose(other_id)
@@ -214,7 +230,7 @@ class Context:
         return self.known_pairs[key]
 
     def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
-        """What strategies with these `needs` read of one image's geometry."""
+        """Return the fingerprint of what strategies with these `needs` read of one image's geometry."""
         key = image_id, needs
         if key not in self.known_fingerprints:
             self.known_fingerprints[key] = self._geometry_fingerprint(image_id, needs)

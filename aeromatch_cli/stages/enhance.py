@@ -117,7 +117,7 @@ def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhance
 
 
 def for_views(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:
-    """The same for the stages after this one: an image that is skipped as it was taken."""
+    """Enhance an image for the stages that make views of it; an image that is skipped is returned as it was taken."""
     if not task.skipped:
         return enhanced(task)
     pixels, valid = _read(task)
@@ -182,7 +182,7 @@ def run(context: Context) -> StageReport:
 
 
 def skipped_images(tasks: Iterable[EnhanceTask]) -> int | None:
-    """How many of the images are left as taken, since they and those they are paired with were taken in the same light;
+    """Count the images that are left as taken, since they and those they are paired with were taken in the same light;
     None where the settings skip none."""
     asked = [
         task.skipped for task in tasks if task.enhancer.keep_source and task.enhancer.same_illumination_minutes > 0.0

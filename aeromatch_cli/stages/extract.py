@@ -50,7 +50,7 @@ def make_task(context: Context, image: Image) -> ExtractTask:
 
 @dataclass(frozen=True)
 class Extracted:
-    """What was found in one image, and what its views cost."""
+    """Counts what was found in one image, and what its views cost."""
 
     keypoints: int
     cost: simulate.ViewCost
@@ -114,7 +114,7 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
 
 
 def _result(made: Sequence[Extracted], tasks: Sequence[ExtractTask], before: StageResult | None) -> ExtractResult:
-    """Of the images made now, and of those that the same command has made before."""
+    """Summarise the images made now, and those that the same command has made before."""
     counts = [item.keypoints for item in made]
     found = ExtractResult(
         keypoints=sum(counts),
@@ -126,7 +126,8 @@ def _result(made: Sequence[Extracted], tasks: Sequence[ExtractTask], before: Sta
 
 
 def run_own_first(context: Context, image_ids: Iterable[str]) -> StageReport:
-    """The same; of a shard its own images first: by the time of the others another machine may have made them."""
+    """Extract features of these images, in a shard its own first: by the time of the others another machine may have
+    made them."""
     ids = set(image_ids)
     own = {image_id for image_id in ids if context.owns(image_id)}
     report = run(context, own)
@@ -143,12 +144,12 @@ def _is_done(task: ExtractTask) -> bool:
 
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:
-    """Those of the images whose features on file are the ones that the present settings and inputs give."""
+    """Return those of the images whose features on file are the ones that the present settings and inputs give."""
     return {i for i in set(image_ids) if known_fingerprint(context.workspace.features(i)) == wanted(context, i)}
 
 
 def wanted(context: Context, image_id: str) -> str:
-    """What the features of an image must carry."""
+    """Return the fingerprint that the features of an image must carry."""
     if context.union is not None:
         return context.union.features.get(image_id, "")
     return task_of(context, image_id).fingerprint

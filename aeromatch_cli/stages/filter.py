@@ -47,7 +47,7 @@ WEAK_MATCHES = 50
 
 @dataclass(frozen=True, eq=False)
 class FilterTask:
-    """All matched pairs of one image."""
+    """Asks for the verification of all matched pairs of one image."""
 
     image_id0: str
     pairs: tuple[PairTask, ...]
@@ -65,12 +65,13 @@ class RowResult:
 
 
 def pair_seed(context: Context, pair: Pair) -> int:
-    """The same for a pair whatever else is in the block."""
+    """Return the random seed of a pair, which is the same whatever else is in the block."""
     return stable_hash(f"{context.settings.seed} {pair.image_id0} {pair.image_id1}") % (1 << 31)
 
 
 def pair_fingerprint(context: Context, pair: Pair) -> str:
-    """What the verdict on a pair must carry: the chain, the matches, the geometry that the chain reads, the seed."""
+    """Return the fingerprint that the verdict on a pair must carry: of the chain, the matches, the geometry that the
+    chain reads, and the seed."""
     return context.once_per_pair("filter", pair, lambda: _pair_fingerprint(context, pair))
 
 
@@ -142,7 +143,7 @@ def match_points(matches: Matches, keypoints0: FloatArray, keypoints1: FloatArra
 
 
 def candidates(matches: Matches, side0: Side, side1: Side) -> Candidates:
-    """What filters see of the matches of two images, each given as keypoints (K, 2) and colours (K, 3) or None."""
+    """Return matches as filters see them. side0, side1: keypoints (K, 2) of an image, and colours (K, 3) or None."""
     points = match_points(matches, side0[0], side1[0])
     if side0[1] is None or side1[1] is None or (matches.indices < 0).any():
         return Candidates(*points)
@@ -188,7 +189,7 @@ def run(context: Context) -> StageReport:
 
 
 def _result_on_file(context: Context, report: StageReport) -> FilterResult | None:
-    """That of the last run, where nothing was made now and the verdicts are the same ones; else None."""
+    """Return the result of the last run, where nothing was made now and the verdicts are the same ones; else None."""
     last = context.workspace.stage_report(report.stage, context.shard.label if context.shard else "")
     if report.done or report.failures or context.overwrite or not last.is_file():
         return None

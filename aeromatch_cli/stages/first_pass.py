@@ -159,7 +159,7 @@ def _pairs(
 
 
 def count_pairs(context: Context, recipe: FirstPass) -> int:
-    """How many pairs a first pass compares, or at most as many; nothing is run."""
+    """Count the pairs that a first pass compares, or at most as many; nothing is run."""
     block = context.block
     count = len(block.images) * (len(block.images) - 1) // 2
     if len(block.poses) < len(block.images):

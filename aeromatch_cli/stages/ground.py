@@ -104,7 +104,7 @@ def judged_ground(
 def judged_altitudes(
     ground: Ground | None, block: Block, found: OrientResult, altitudes: tuple[Ground, str] | None
 ) -> list[str]:
-    """What the ground says against heights above the take-off point. found: by the orientation."""
+    """Say where heights above the take-off point disagree with the ground. found: result of the orientation."""
     if altitudes is None or ground is None or not block.poses or found.frame == "own":
         return []
     off_m, _, flying_m = heights_above_m(altitudes[0], ground, _centers_m(block))

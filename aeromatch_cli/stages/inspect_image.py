@@ -1,4 +1,5 @@
-"""What becomes of one image before features are found in it, made anew for somebody who wants to look."""
+"""This module shows what becomes of one image before features are found in it, made anew for somebody who wants to
+look."""
 
 from __future__ import annotations
 

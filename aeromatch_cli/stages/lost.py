@@ -32,7 +32,7 @@ def lost_images(results: BlockResults, unread: Sequence[tuple[str, str]], names:
 
 
 def lost_lines(workspace: Workspace, lost: Sequence[Lost], images: int) -> list[str]:
-    """What is said of lost images, nothing where there are none. images: of the whole folder."""
+    """Say in lines which images the result does not hold. images: number of those in the whole folder."""
     if not lost:
         return []
     counts = ", ".join(f"{count} {what}" for what, count in sorted(Counter(what for _, what, _ in lost).items()))

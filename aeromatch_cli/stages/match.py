@@ -30,7 +30,7 @@ from aeromatch_cli.workspace import Workspace
 
 @dataclass(frozen=True, eq=False)
 class MatchTask:
-    """All pairs of one image. matchers: by image_id1."""
+    """Asks for the matches of all pairs of one image. matchers: by image_id1."""
 
     image_id0: str
     pairs: tuple[PairTask, ...]
@@ -58,7 +58,8 @@ def matcher_of(context: Context, pair: Pair) -> Matcher:
 
 
 def pair_fingerprint(context: Context, pair: Pair) -> str:
-    """What the matches of a pair must carry: matcher, both images' features, and their geometry."""
+    """Return the fingerprint that the matches of a pair must carry: of the matcher, both images' features, and their
+    geometry."""
     if context.union is not None:
         return context.union.matches.get((pair.image_id0, pair.image_id1), "")
     return context.once_per_pair("match", pair, lambda: _pair_fingerprint(context, pair))
@@ -80,7 +81,7 @@ def paired_images(context: Context) -> set[str]:
 
 
 def images_of_rows(context: Context) -> set[str]:
-    """The same, and the images of the shard itself."""
+    """Return the images of all pairs of the shard, and the images of the shard itself."""
     return paired_images(context) | {image.image_id for image in context.images()}
 
 

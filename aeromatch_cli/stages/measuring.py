@@ -51,8 +51,8 @@ class ByImage:
 
 @dataclass(frozen=True, eq=False)
 class MeasureTask:
-    """All keypoints of one image that are measured by others. path, fingerprint: of the file that keeps what was found,
-    and what it must carry; "" where none keeps it."""
+    """Asks for the measurement of all keypoints of one image that others measure. path, fingerprint: of the file that
+    keeps what was found, and what it must carry; "" where none keeps it."""
 
     image_id: str
     by: tuple[ByImage, ...]
@@ -68,7 +68,7 @@ class MeasureTask:
         return np.concatenate([one.own_patches for one in self.by])
 
     def with_patches(self) -> MeasureTask:
-        """By those of the others that have patches: pictures of the rest could not be read."""
+        """Return the task without the other images that have no patches, whose pictures could not be read."""
         own = patches_of(self.folder, self.image_id).is_file()
         by = tuple(one for one in self.by if own and patches_of(self.folder, one.image_id).is_file())
         return self if len(by) == len(self.by) else replace(self, by=by, fingerprint="")
@@ -76,7 +76,8 @@ class MeasureTask:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Of keypoints (N,): shifts (N, 2), whether they hold, pixels from those of the other image (N, 2, 2)."""
+    """Holds the measurements of keypoints (N,): shifts (N, 2), whether they hold, and pixels from those of the other
+    image (N, 2, 2)."""
 
     shifts_px: FloatArray
     held: BoolArray
@@ -108,7 +109,7 @@ def cut_patches(task: CutTask) -> int:
 
 
 def _far_inside(shape: tuple[int, ...], valid: BoolArray | None, places: IntArray) -> BoolArray:
-    """Which places (N, 2), x and y, have nothing invalid within the reach of a window."""
+    """Return which places (N, 2), x and y, have nothing invalid within the reach of a window."""
     import cv2
 
     inside = (places >= REACH_PX) & (places < np.array(shape[1::-1]) - REACH_PX)
@@ -149,7 +150,7 @@ def _save(found: Measured, made_of: str, stream: BinaryIO) -> None:
 
 
 def kept_measurements(task: MeasureTask) -> Measured | None:
-    """What the file of an earlier run has kept, where it is of the same measurements; None, with a warning, where it is
+    """Read what an earlier run has kept, where it is of the same measurements; None, with a warning, where the file is
     broken."""
     try:
         found = load_arrays(task.path, ("fingerprint", "shifts_px", "held", "matrices"))
@@ -164,8 +165,8 @@ def kept_measurements(task: MeasureTask) -> Measured | None:
 def measurement_fingerprint(
     recipe: LeastSquares, versions: object, by: Sequence[ByImage], sources: Sequence[str]
 ) -> str:
-    """Of everything that measurements of one image depend on. sources: fingerprints of its picture and of those of the
-    others, in their order."""
+    """Return the fingerprint of everything that measurements of one image depend on. sources: fingerprints of its
+    picture and of those of the others, in their order."""
     places = [hashlib.sha256(one.places_px.tobytes() + one.own_places_px.tobytes()).hexdigest() for one in by]
     return fingerprint(versions, recipe, sources, [(one.image_id, one.geometry) for one in by], places)
 

@@ -58,7 +58,7 @@ def runs_network(settings: Settings) -> bool:
 def jobs_within(
     budget: float, jobs: int, images: Iterable[Image], *, network: bool, max_size_px: int = 0
 ) -> tuple[int, str]:
-    """How many workers a budget in megabytes allows, one at least, and what is to be said where it allows fewer.
+    """Return how many workers a budget in megabytes allows, one at least, and what is to be said where it allows fewer.
 
     max_size_px: longer side to which larger images are reduced, 0 for none. Raises ConfigError where the budget does
     not hold the largest image.

@@ -1,4 +1,4 @@
-"""What stages have found, in lines for people."""
+"""This module says in lines for people what stages have found."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _skipped_words(count: int | None) -> list[str]:
 
 
 def settled_words(found: MatchResult) -> str:
-    """Which steps of a cascade have given how many pairs enough matches, "" without a cascade."""
+    """Say which steps of a cascade have given how many pairs enough matches, "" without a cascade."""
     if found.not_settled is None:
         return ""
     by, lacking = found.settled_by, found.not_settled
@@ -100,7 +100,7 @@ def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) 
 
 
 def orientation_lines(found: OrientResult, given: Block, block: Block) -> list[str]:
-    """How the block was oriented, and what of that which was given is wrong."""
+    """Say how the block was oriented, and what of the given poses and cameras is wrong."""
     names = {image.image_id: image.name for image in block.images}
     words = _given_words(found, given) if found.poses_from == "given poses" else _picture_words(found, given, block)
     for camera_id, focal in found.focal_lengths.items():
@@ -152,7 +152,7 @@ def _picture_words(found: OrientResult, given: Block, block: Block) -> list[str]
 
 
 def frame_remarks(found: OrientResult, groups: Sequence[Group]) -> list[str]:
-    """What nothing ties to the world. groups: images that were oriented together."""
+    """Say which groups of images nothing ties to the world. groups: images that were oriented together."""
     beside = sum(len(group.images) for group in groups if group.kind == "level")
     if not beside:
         return []
@@ -190,7 +190,7 @@ def _adjust_lines(found: AdjustResult, images: int, names: Mapping[str, str]) ->
 
 
 def _consistency_lines(found: ConsistencyResult, names: Mapping[str, str]) -> list[str]:
-    """What was dropped, and images that the adjusted block seems to hold in a wrong place."""
+    """Say what was dropped, and which images the adjusted block seems to hold in a wrong place."""
     doubtful = _listed([names[i] for i in found.doubtful])
     lines = [f"too many matches contradict the adjusted poses of {doubtful}"] if doubtful else []
     if found.spread:
@@ -221,7 +221,7 @@ def _spread_words(found: ConsistencyResult) -> str:
 
 
 def control_of(groups: Sequence[GroupResult]) -> list[ControlInGroup]:
-    """What control points did in the adjustment of every group that has some."""
+    """Return what control points did in the adjustment of every group that has some."""
     return [group.control for group in groups if group.control is not None]
 
 
@@ -258,7 +258,7 @@ def _axes(errors_m: Xyz) -> str:
 
 
 def _adjusted_words(control: ControlInGroup) -> Iterator[str]:
-    """What control points did in the adjustment of a group."""
+    """Yield in words what control points did in the adjustment of a group."""
     if control.fault:
         yield f"warning: the control points fit the block if {control.fault}: correct the list"
     if control.exchanged:

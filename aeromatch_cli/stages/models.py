@@ -85,7 +85,7 @@ def _mapped(context: Context, recipe: FirstPass, first: Context, evidence: First
 
 
 def _with_more_keypoints(context: Context, best: Mapped) -> Mapped | None:
-    """Of a block that falls into parts."""
+    """Map the block from a first pass with more keypoints, where it falls into parts; None otherwise."""
     falls_apart = _largest(best.models) < _WHOLE * len(context.block.images) <= len(best.evidence.matched)
     dearer = first_pass.thorough(best.recipe, best.first) if falls_apart and best.recipe.replaces else None
     if dearer is None:
@@ -94,7 +94,7 @@ def _with_more_keypoints(context: Context, best: Mapped) -> Mapped | None:
 
 
 def _without_positions(context: Context, best: Mapped) -> Mapped | None:
-    """Where positions do not fit the pictures, pairs chosen by them are not those of neighbours."""
+    """Map the block from pairs that were not chosen by positions, where these do not fit the images; None otherwise."""
     if not context.block.poses or not best.contradicted:
         return None
     first, evidence = evidence_of(context, best.recipe, by_position=False)

@@ -18,7 +18,7 @@ def names_on_file(workspace: Workspace) -> dict[str, str]:
 
 
 def item_named(item: str, names: Mapping[str, str]) -> str:
-    """What has failed, as people know it: an image id by its name, "id0 id1" by both, anything else as it is."""
+    """Name what has failed as people know it: an image id by its name, "id0 id1" by both, anything else as it is."""
     ids = item.split(" ")  # ids have no spaces
     return " and ".join(names[i] for i in ids) if all(i in names for i in ids) else item
 

@@ -129,7 +129,8 @@ def groups(context: Context) -> list[Group]:
 def _solution(
     context: Context, recipe: FirstPass, kept: set[str], before: Mapping[str, Any]
 ) -> tuple[Solution, dict[str, Any]]:
-    """What the first pass says; and its pairs, those that look alike, and what failed in it.
+    """Find the orientation from the first pass; return it with the pairs of that pass, those that look alike, and what
+    failed.
 
     kept: images that have not changed since an earlier run, whose poses and terrain stay as they were where the new
     ones agree with them. before: the record of that run.
@@ -182,7 +183,8 @@ def _solution(
 def _with_better_cameras(
     context: Context, first: Context, evidence: FirstPassMatches
 ) -> tuple[Context, Context, FirstPassMatches]:
-    """All three with other focal lengths, where those given cannot be right."""
+    """Return both contexts and the matches of the first pass with other focal lengths, where those given cannot be
+    right."""
     block = evidence.block
     camera_ids = {image.image_id: image.camera_id for image in block.images}
     seen = evidence.pairs, block.poses, block.cameras, camera_ids, evidence.thresholds_px
@@ -252,7 +254,7 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
 
 
 def _terrains(context: Context, record: Mapping[str, Any]) -> tuple[Terrain, ...]:
-    """Those on file, the largest flight's first. record: orientation.json."""
+    """Read the terrains on file, the largest flight's first. record: orientation.json."""
     names = sorted(
         (name for name in record.get("files", ()) if name.endswith(".tif")), key=lambda name: (len(name), name)
     )

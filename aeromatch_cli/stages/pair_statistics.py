@@ -1,4 +1,4 @@
-"""evidence: what steps of a cascade have found of a pair, what it lacks, and what a further step may find.
+"""Pair statistics: what steps of a cascade have found of a pair, what it lacks, and what a further step may find.
 
 The logarithm of the expected number is linear in those of what is known. The weights are the steps' own, found on
 rendered blocks by `scripts/bench evidence`, which draws how far they hold on others. Coverage, candidates and
@@ -37,7 +37,7 @@ _POOR = 0.75
 
 @dataclass(frozen=True)
 class PairStatistics:
-    """What steps have found of a pair.
+    """Holds what the steps of a cascade have found of a pair.
 
     verified: matches, those of two steps in one place once. overlap: share of the image that the other one shows, of
     the image where it is larger. coverage: share of the overlap's cells that verified matches lie in; both NaN where
@@ -74,7 +74,7 @@ class PairStatistics:
         return max(_LEAST_MATCHES, round(promised * min(1.0, self.keypoints / _ENOUGH_KEYPOINTS)))
 
     def lacks(self, step: Step) -> str:
-        """What keeps the pair from needing no step like this, "" where nothing does."""
+        """Say what the pair lacks so that it needs a step like this, "" where it lacks nothing."""
         known = self.overlap > 0.0
         share = self.overlap if known else 1.0
         least = self.enough(step)
@@ -87,7 +87,7 @@ class PairStatistics:
         return ""
 
     def asks_for(self, step: Step, keypoints: int) -> str:
-        """Why the pair takes the step, "" where it need not. keypoints: most that the step finds in an image."""
+        """Say why the pair takes the step, "" where it need not. keypoints: most that the step finds in an image."""
         expected = self.expected(step, keypoints)
         lacks = self.lacks(step)
         if lacks:
@@ -112,7 +112,7 @@ class PairStatistics:
 
 
 def _rounded(number: float) -> int:
-    """To two digits."""
+    """Round to two significant digits."""
     return int(float(f"{number:.2g}"))
 
 
@@ -128,7 +128,8 @@ def columns(evidence: PairStatistics, keypoints: int) -> FloatArray | None:
 
 
 def expected_number(known: FloatArray, weights: Sequence[float]) -> float:
-    """Of verified matches of a pair with such `columns` (5,) after a step with these weights (5,)."""
+    """Return the expected number of verified matches of a pair with such `columns` (5,) after a step with these weights
+    (5,)."""
     return max(0.0, float(np.exp(known @ np.array(weights))) - _FEW)
 
 

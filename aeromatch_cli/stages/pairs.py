@@ -143,7 +143,8 @@ def _check_pairs(context: Context) -> None:
 
 
 def _with_ground(context: Context, found: BlockRead) -> Context:
-    """With the ground below relative altitudes where the pictures tell no terrain, and the ground sampling distance."""
+    """Return the context with the ground below relative altitudes, where the images show no terrain, and the ground
+    sampling distance."""
     block = context.block
     if block.ground is None and found.ground_hint is not None:
         block = replace(block, ground=found.ground_hint[0], ground_source=found.ground_hint[1])
@@ -212,7 +213,7 @@ def chosen_strategies(settings: Settings) -> Iterator[Strategy]:
 
 
 def _remarks(settings: Settings) -> list[str]:
-    """What the recipe brings that its user may not expect."""
+    """Say what the settings bring that their user may not expect."""
     return [f"own weights      {path}" for strategy in chosen_strategies(settings) for path in strategy.own_weights()]
 
 

@@ -44,7 +44,7 @@ def _measure(picture: Path | RemoteFile) -> PictureQuality:
 
 
 def remarks(context: Context, found: Mapping[str, PictureQuality]) -> list[str]:
-    """What a person should know of the pictures, one sentence for each kind."""
+    """Say what a person should know of the images, one sentence for each kind."""
     images = sorted((image for image in context.block.images if image.image_id in found), key=lambda image: image.name)
     kinds: dict[str, list[str]] = defaultdict(list)
     cameras: dict[str, list[str]] = defaultdict(list)

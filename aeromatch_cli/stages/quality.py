@@ -44,7 +44,7 @@ def _contradicted(consistency: ConsistencyResult) -> float | None:
 
 
 def results_of(workspace: Workspace, reports: Sequence[StageReport] = ()) -> BlockResults:
-    """Those of a command's own reports, and of other stages those on file."""
+    """Return the results of a command's own reports, and of other stages those on file."""
     own = {report.stage: report.result for report in reports if not report.part}
     kinds = {stage: graph.BY_NAME[stage].result for stage in BlockResults.model_fields}
     return BlockResults(
@@ -53,5 +53,5 @@ def results_of(workspace: Workspace, reports: Sequence[StageReport] = ()) -> Blo
 
 
 def quality_on_file(workspace: Workspace, names: Mapping[str, str]) -> Quality | None:
-    """From what the stages have left in a workspace."""
+    """Judge the block by what the stages have left in a workspace."""
     return quality_of(results_of(workspace), names)

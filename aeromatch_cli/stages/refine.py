@@ -93,13 +93,13 @@ def _read(source: Source) -> bool:
 
 
 def made_fingerprint(context: Context) -> str:
-    """Of the measured places on file, "" where there are none."""
+    """Return the fingerprint of the measured places on file, "" where there are none."""
     record = context.workspace.refined_files
     return str(read_json(record).get("fingerprint", "")) if record.is_file() else ""
 
 
 def current_fingerprint(context: Context) -> str:
-    """Of the measured places of the present results."""
+    """Return the fingerprint that measured places of the present results must carry."""
     recipe, block = context.settings.least_squares, context.block
     if recipe is None:
         return ""
@@ -206,8 +206,8 @@ def _comparable(geometry: PairGeometry) -> bool:
 
 
 def _measured(context: Context, table: _Table, recipe: LeastSquares, report: StageReport) -> Measured:
-    """Of all keypoints of the block; those of images for which nothing has changed are on file. Patches are there as
-    long as they are needed: those of 10,000 images would fill a disk."""
+    """Measure all keypoints of the block; those of images for which nothing has changed are on file. Patches are there
+    as long as they are needed: those of 10,000 images would fill a disk."""
     folder = context.workspace.refined_files.parent
     by = {image_id: table.measured_by(image_id) for image_id in table.names}
     found, todo = Measured.nothing(len(table.trees.parent)), list[str]()
@@ -248,7 +248,7 @@ def _measured(context: Context, table: _Table, recipe: LeastSquares, report: Sta
 def _task(
     context: Context, table: _Table, recipe: LeastSquares, image_id: str, by: Mapping[str, tuple[IntArray, IntArray]]
 ) -> MeasureTask:
-    """Of one image, by all others that measure some of its keypoints."""
+    """Return the task of one image, measured by all others that measure some of its keypoints."""
     parts = []
     for other, (numbers, own_numbers) in by.items():
         places = table.places_px[other][numbers], table.places_px[image_id][own_numbers]

@@ -1,4 +1,4 @@
-"""What a run comes to, in words: how good the block is, where it is weak, and what to do."""
+"""This module sums up a run in words: how good the block is, where it is weak, and what to do."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from aeromatch_cli.workspace import Workspace
 
 
 class Entry(Protocol):
-    """What a row holds of one pair."""
+    """Requires of an entry of a row, which holds one pair, that it states its fingerprint."""
 
     @property
     def fingerprint(self) -> str: ...
@@ -126,5 +126,5 @@ def is_done(pairs: Sequence[PairTask], on_file: Mapping[str, str]) -> bool:
 
 
 def kept(pairs: Sequence[PairTask], on_file: Mapping[str, str]) -> int:
-    """How many of the wanted pairs are on file and up to date."""
+    """Count the wanted pairs that are on file and up to date."""
     return sum(on_file.get(pair.image_id1) == pair.fingerprint for pair in pairs)

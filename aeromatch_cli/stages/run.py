@@ -66,9 +66,9 @@ _EXPORTING = ("run", "export", "check")
 
 @dataclass(frozen=True)
 class Result:
-    """What a command says: lines for people, facts for machines; failures, and the verdict on the block where there is
-    one, for the exit code. urgent: those of the lines that are said even where quiet is asked for. reports: of the
-    stages."""
+    """Holds what a command says: lines for people, facts for machines; failures, and the verdict on the block where
+    there is one, for the exit code. urgent: those of the lines that are said even where quiet is asked for. reports: of
+    the stages."""
 
     lines: tuple[str, ...]
     facts: dict[str, Any] = field(default_factory=dict)
@@ -124,14 +124,14 @@ def execute(
 
 
 def _named(result: Result, root: Path) -> Result:
-    """The same as people and other programs get it: with names of files in place of image ids."""
+    """Return the result as people and other programs get it: with names of files in place of image ids."""
     names = names_on_file(Workspace(root))
     failures = tuple((stage, item_named(item, names), reason) for stage, item, reason in result.failures)
     return replace(result, facts=with_names(result.facts, names), failures=failures)
 
 
 def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> Result:
-    """Of a whole run that has nothing to do."""
+    """Return the result of a whole run that has nothing to do."""
     workspace = Workspace(Path(settings.workspace).absolute())
     names = {image.image_id: image.name for image in read_images(workspace.images)}
     block = _block_of(reports)
@@ -143,8 +143,8 @@ def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> R
 
 @contextmanager
 def _nothing_left_of_a_failed_start(workspace: Workspace, *, shared: bool) -> Iterator[None]:
-    """Where nothing could be started, no folder is left but those that were there before. shared: other shards may be
-    at work in the workspace."""
+    """Leave no folder but those that were there before, where nothing could be started. shared: other shards may be at
+    work in the workspace."""
     root = workspace.root
     absent = [folder for folder in (root, *root.absolute().parents) if not folder.exists()]
     try:
@@ -253,14 +253,14 @@ def _there(settings: Settings) -> bool:
 
 
 def _stages_of(command: str, context: Context) -> list[StageReport]:
-    """What a command brings up to date; made anew, where that is asked for, is only its own stage, and of `adjust` what
-    belongs to it."""
+    """Bring the stages of a command up to date; where results are to be made anew, only its own stage is, and of
+    `adjust` what belongs to it."""
     kept = replace(context, overwrite=False) if command == "export" else context
     return [FUNCTIONS[name](context if name == command else kept) for name in graph.COMMANDS[command]]
 
 
 def _cascaded(context: Context) -> tuple[Context, list[StageReport]]:
-    """All steps of a cascade and, unless it is a shard, what they have found together."""
+    """Run all steps of a cascade and, unless it is a shard, merge what they have found."""
     steps = cascade.run(context)
     if context.shard is not None:
         return context, [report for step in steps for report in step.reports]
@@ -291,7 +291,7 @@ def _run_all(context: Context) -> list[StageReport]:
 
 
 def _without_keypoints(context: Context) -> str:
-    """Of a block none of whose pairs is verified: how many images show nothing to match, and what may hide it."""
+    """Say of a block none of whose pairs is verified how many images show nothing to match, and what may hide it."""
     paths = [context.workspace.features(image.image_id) for image in context.block.images]
     empty = sum(path.is_file() and not len(read_keypoints(path)[0]) for path in paths)
     if not empty:
@@ -387,7 +387,7 @@ def _result(
 
 
 def _block_of(reports: Sequence[StageReport]) -> PairsResult:
-    """What the stage pairs has found; every command runs it."""
+    """Return the result of the stage pairs; every command runs it."""
     return next(report.result for report in reports if isinstance(report.result, PairsResult))
 
 
@@ -398,7 +398,8 @@ def _left(workspace: Workspace, settings: Settings) -> list[Path]:
 
 
 def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:
-    """By stage; those of the steps of a shard's cascade below the key `steps`, by step."""
+    """Return the facts of the stages by name; those of the steps of a shard's cascade are below the key `steps`, by
+    step."""
     found: dict[str, Any] = {}
     for r in reports:
         step = r.part.removeprefix("step ").removesuffix(": ")
@@ -415,7 +416,7 @@ def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:
 
 
 def _all_failures(command: str, context: Context, reports: list[StageReport]) -> tuple[tuple[str, str, str], ...]:
-    """What failed now, and what failed in the stages before this command and still stands."""
+    """Return what failed now, and what failed in the stages before this command and still stands."""
     failures = {(r.stage, item, reason) for r in reports for item, reason in r.failures}
     before = graph.RUN if command == "run" else graph.RUN[: graph.RUN.index(command)] if command in graph.RUN else ()
     for stage, item, reason in gather_failures(context.workspace):

@@ -1,4 +1,5 @@
-"""What other settings than those of the last run mean for a workspace, said before its results are replaced."""
+"""This module says what other settings than those of the last run mean for a workspace, before its results are
+replaced."""
 
 from __future__ import annotations
 
@@ -37,7 +38,7 @@ def changed_words(config: Path, settings: Settings) -> str:
 
 
 def _resolved(value: Any) -> Any:
-    """The same file or folder, however it is written, is the same value."""
+    """Return a value that is the same for one file or folder, however its path is written."""
     return str(Path(value).resolve()) if isinstance(value, str) and "/" in value and Path(value).exists() else value
 
 

@@ -18,7 +18,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """From "i/n", 1 <= i <= n. Raises ConfigError."""
+        """Read "i/n", 1 <= i <= n. Raises ConfigError."""
         found = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
         index, count = map(int, found.groups()) if found else (0, 0)
         if not 1 <= index <= count:

@@ -98,7 +98,7 @@ def further_views(pictures: Sequence[ViewPixels]) -> int:
 
 @dataclass(frozen=True)
 class ViewCost:
-    """How many views were made, and of how many megapixels together."""
+    """Counts the views that were made, and their megapixels together."""
 
     views: int
     megapixels: float
@@ -138,7 +138,7 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
 
 
 def _write_pictures(task: SimulateTask, pictures: Sequence[ViewPixels], record: Mapping[str, Any]) -> None:
-    """In place of those that are there."""
+    """Write the pictures of the views in place of those that are there."""
     workspace, image_id = task.enhance.workspace, task.enhance.image_id
     names = [f"{item.view.name}.png" for item in pictures]
     folder = workspace.views(image_id).parent
@@ -151,8 +151,8 @@ def _write_pictures(task: SimulateTask, pictures: Sequence[ViewPixels], record: 
 
 
 def degenerate_view(workspace: Workspace, image: Image) -> str:
-    """What views.json says of a ground view that shows nothing, "" where there is none: the reason stated, or views
-    that together have too few pixels."""
+    """Return what views.json says of a ground view that shows nothing, "" where there is none: the reason stated, or
+    views that together have too few pixels."""
     record = whole_record(workspace.views(image.image_id))
     if not record or record.get("remark"):
         return str(record.get("remark", ""))

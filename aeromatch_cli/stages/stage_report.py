@@ -1,4 +1,4 @@
-"""What a stage leaves behind: its report, the list of all failures, and how its tasks are run."""
+"""This module keeps what a stage leaves behind: its report, the list of all failures, and how its tasks are run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ log = logging.getLogger("aeromatch")
 
 @dataclass
 class StageReport:
-    """What one stage did; becomes reports/<stage>.json.
+    """Counts what one stage did; it becomes reports/<stage>.json.
 
     items = done (made now) + skipped (up to date already) + failed; items are images, pairs or exporters. part: of a
     step of a cascade, in words.
@@ -87,7 +87,7 @@ class StageReport:
 
 
 def result_on_file(workspace: Workspace, kind: type[R]) -> R | None:
-    """What a stage left in its report, None where there is none, or one of another version."""
+    """Return the result that a stage left in its report, None where there is none, or one of another version."""
     path = workspace.stage_report(kind.stage)
     return kind.of_json(read_json(path).get("result")) if path.is_file() else None
 

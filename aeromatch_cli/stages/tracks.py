@@ -52,7 +52,7 @@ class Tracks:
 def tracks_of(
     pairs: Sequence[MatchedPair], grid_px: Callable[[str], FloatArray], camera_of: Callable[[str], Camera]
 ) -> Tracks:
-    """Of pairs whose matches lead from a keypoint of one image to a place in the other."""
+    """Return the tracks of pairs whose matches lead from a keypoint of one image to a place in the other."""
     table = _Table()
     for item in pairs:
         table.add_image(item.pair.image_id0, grid_px)
@@ -83,7 +83,7 @@ class _Table:
         self._standing: dict[str, IntArray] = {}
 
     def add_image(self, image_id: str, grid_px: Callable[[str], FloatArray]) -> None:
-        """Its grid, every point a track of its own."""
+        """Add an image's grid, every point a track of its own."""
         if image_id in self.sizes:
             return
         points = np.asarray(grid_px(image_id), np.float64)
@@ -181,12 +181,12 @@ def _root(parent: dict[int, int], track: int) -> int:
 
 
 def _agree(first: Mapping[str, FloatArray], second: Mapping[str, FloatArray]) -> bool:
-    """In every image that both are seen in."""
+    """Return whether two tracks agree in every image that both are seen in."""
     return all(float(np.hypot(*(first[name] - second[name]))) <= _AGREE_PX for name in first.keys() & second.keys())
 
 
 def _on_model(kind: str, model: FloatArray, places: Sequence[FloatArray], camera0: Camera, camera1: Camera) -> IntArray:
-    """Which matches lie on a pair's model; none where it is no epipolar one."""
+    """Return which matches lie on a pair's model; none where it is no epipolar one."""
     if kind not in ("E", "F") or not len(places[0]):
         return np.zeros(0, np.int64)
     matrix = fundamental(model, camera0, camera1) if kind == "E" else model

@@ -56,8 +56,8 @@ class KeypointsTask:
 
 @dataclass(frozen=True, eq=False)
 class RowTask:
-    """All pairs of one image. pairs: image_id1 -> fingerprint; steps: by image_id1, the name of the step whose features
-    the matches use, and the workspace that has them."""
+    """Asks for the merging of all pairs of one image. pairs: image_id1 -> fingerprint; steps: by image_id1, the name of
+    the step whose features the matches use, and the workspace that has them."""
 
     image_id0: str
     pairs: Mapping[str, str]
@@ -136,7 +136,7 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
 
 
 def _failures(steps: Sequence[StepContext], *stages: str) -> list[tuple[str, str]]:
-    """Of these stages of all steps, each item once."""
+    """Return the failures of these stages of all steps, each item once."""
     found: dict[str, str] = {}
     for step in steps:
         for one, item, reason in gather_failures(step.context.workspace):
@@ -146,7 +146,7 @@ def _failures(steps: Sequence[StepContext], *stages: str) -> list[tuple[str, str
 
 
 def _count_seconds(report: StageReport, steps: Sequence[StepContext], stages: Collection[str]) -> None:
-    """What the steps' own stages took is part of what the stage takes."""
+    """Count the time of the steps' own stages as part of the stage's time."""
     report.started -= sum(one.seconds for step in steps for one in step.reports if one.stage in stages)
 
 
@@ -299,7 +299,7 @@ def joined_matches(
 
 
 def _rows_in(rows: IntArray, wanted: IntArray) -> BoolArray:
-    """Which rows (N, 2) of numbers are among the wanted ones (M, 2)."""
+    """Return which rows (N, 2) of numbers are among the wanted ones (M, 2)."""
     width = int(max(rows.max(initial=0), wanted.max(initial=0))) + 1
     codes, known = (pairs.astype(np.int64) @ [width, 1] for pairs in (rows, wanted))
     return np.isin(codes, known)

@@ -1,4 +1,5 @@
-"""unchanged: a finished run of which nothing has changed since, so that the same command need not look into it.
+"""This module recognises a finished run of which nothing has changed since, so that the same command need not look into
+it.
 
 The record WORK/finished.json holds digests of the status (size, times of the last change of contents and of the file)
 of every input and every file of the workspace, and of the settings, the program and its libraries. Where all are the
@@ -52,8 +53,8 @@ def state_of_inputs(settings: Settings) -> dict[str, str]:
 
 
 def unchanged_reports(workspace: Workspace, inputs: Mapping[str, str]) -> list[StageReport] | None:
-    """What the run from these inputs has left, as reports of stages that have made nothing; None where anything has
-    changed since, or it left no record."""
+    """Return what the run from these inputs has left, as reports of stages that have made nothing; None where anything
+    has changed since, or it left no record."""
     if not inputs or not workspace.finished.is_file():
         return None
     try:
@@ -67,7 +68,7 @@ def unchanged_reports(workspace: Workspace, inputs: Mapping[str, str]) -> list[S
 
 
 def _report(workspace: Workspace, stage: str, *, items: int, result: Any) -> StageReport:
-    """Of a stage that has made nothing. result: None for the one on file."""
+    """Return the report of a stage that has made nothing. result: None for the one on file."""
     kind = graph.BY_NAME[stage].result
     found = result_on_file(workspace, kind) if result is None else kind(**result)
     return StageReport(stage, items=items, skipped=items, result=found)
@@ -109,7 +110,7 @@ def _beside(folder: Path) -> Iterator[Path]:
 
 
 def _files_below(folder: Path, passed_over: Iterable[Path]) -> Iterator[Path]:
-    """All files, links followed, but of hidden folders and those passed over."""
+    """Yield all files, links followed, but of hidden folders and those passed over."""
     visited = {os.path.realpath(path) for path in passed_over}
     for parent, folders, files in os.walk(folder, followlinks=True):
         real = os.path.realpath(parent)

@@ -231,8 +231,8 @@ def _explained(network: Network, state: Unknowns, options: Options) -> tuple[Net
 def _worth(
     network: Network, state: Unknowns, tried: Network, tolerance: float
 ) -> tuple[float, Network, Unknowns] | None:
-    """By how much further unknowns lower the sum of squares, their network and its solution; None where that is too
-    little. Positions weigh by what they are off by once it is taken."""
+    """Return by how much further unknowns lower the sum of squares, their network and its solution; None where that is
+    too little. Positions weigh by what they are off by once it is taken."""
     unknowns = _freed_since(network, tried)
     if not _count(unknowns):
         return None
@@ -280,7 +280,7 @@ _Freed = tuple[BoolArray, BoolArray, BoolArray]
 
 
 def _freed_since(before: Network, after: Network) -> _Freed:
-    """Which unknowns of lenses, mounts and flights are free in one network and not in the other."""
+    """Return which unknowns of lenses, mounts and flights are free in the second network and not in the first."""
     names = ("lens_sigmas", "mount_sigmas", "flight_sigmas")
     lens, mount, flight = ((getattr(after, name) > 0.0) & (getattr(before, name) == 0.0) for name in names)
     return lens, mount, flight

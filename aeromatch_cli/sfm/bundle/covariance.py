@@ -32,9 +32,9 @@ _UNDETERMINED_DEG = 45.0
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """In which errors count. free: (6 B, D) movements of the whole block that no observation sees; onto: (D, 6 B) how
-    much of each a change of the unknowns has; known: whether the movements are known as far as they can be.
-    """
+    """Describes the frame in which errors count. free: (6 B, D) movements of the whole block that no observation sees;
+    onto: (D, 6 B) how much of each a change of the unknowns has; known: whether the movements are known as far as they
+    can be."""
 
     free: FloatArray
     onto: FloatArray
@@ -75,7 +75,8 @@ class Covariance:
 
 
 def covariance(network: Network, state: Unknowns) -> Covariance:
-    """Of the unknowns at a solution, for residuals as large as the standard deviations of the network."""
+    """Return the covariance of the unknowns at a solution, for residuals as large as the standard deviations of the
+    network."""
     layout = Layout.of(network)
     normals = reduced(equations(network, state))
     frame = _frame(network, state, normals)
@@ -171,7 +172,8 @@ def _of_control(network: Network, state: Unknowns, extent_m: float) -> FloatArra
 
 
 def _frame(network: Network, state: Unknowns, normals: Reduced) -> _Frame:
-    """That of a free network, or of the world, whose frame is known as far as it is."""
+    """Return the frame of a free network, or that of the world, which counts as known as far as observations determine
+    it."""
     free = _free_movements(network, state, normals)
     if _in_world(network):
         # Apart from the free movements, as unknowns in units of what observations know of each.
@@ -184,7 +186,8 @@ def _frame(network: Network, state: Unknowns, normals: Reduced) -> _Frame:
 
 
 def _factors(state: Unknowns, normals: Reduced, frame: _Frame) -> Factors:
-    """Of the normal equations, free movements held at some images: one of the inverses that they leave."""
+    """Factorise the normal equations with the free movements held at some images; this gives one of the inverses that
+    they leave."""
     from scipy import sparse
 
     images, diagonal = len(state.centers_m), normals.matrix.diagonal()
@@ -198,8 +201,8 @@ def _factors(state: Unknowns, normals: Reduced, frame: _Frame) -> Factors:
 
 
 def _moved(free: FloatArray, by_frame: FloatArray, among: FloatArray) -> FloatArray:
-    """What the frame adds to blocks (..., r, r) of the inverse on its diagonal, from rows (..., r, D) of the free
-    movements and of the inverse by the frame, and from the inverse among the movements (D, D)."""
+    """Return what the frame adds to blocks (..., r, r) of the inverse on its diagonal, from rows (..., r, D) of the
+    free movements and of the inverse by the frame, and from the inverse among the movements (D, D)."""
     crossed = free @ by_frame.swapaxes(-1, -2)
     return np.asarray(free @ among @ free.swapaxes(-1, -2) - crossed - crossed.swapaxes(-1, -2))
 

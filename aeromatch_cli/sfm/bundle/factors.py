@@ -46,7 +46,7 @@ class _Part:
 
 
 class Factors:
-    """Of a symmetric, positive definite matrix (6 B, 6 B) whose rows may have any units.
+    """Holds the factors of a symmetric, positive definite matrix (6 B, 6 B) whose rows may have any units.
 
     places: (B', 2) of the first B' blocks in the plane, those that are divided; blocks that come after them, and those
     in `together` (T,), may couple with all others. A matrix that is far from positive definite raises LinAlgError.
@@ -131,7 +131,7 @@ def _divided(graph: sparse.csr_matrix, places: FloatArray, members: IntArray) ->
 
 
 def _in_order(part: _Part) -> Iterator[_Part]:
-    """All parts, those that are eliminated before others first."""
+    """Yield all parts, those that are eliminated before others first."""
     for inner in part.parts:
         yield from _in_order(inner)
     yield part

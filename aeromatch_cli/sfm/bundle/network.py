@@ -1,4 +1,4 @@
-"""What a bundle adjustment is made of: observations with their standard deviations, and the unknowns.
+"""The observations of a bundle adjustment with their standard deviations, and its unknowns.
 
 Frames: world metres (x east, y north, z up); camera x right, y down, z forward; pixels in one frame of the caller's
 choice, which the principal points share. All arrays are float64 and rows are dense, zero-based.

@@ -31,7 +31,7 @@ _BEHIND_SIGMAS = 1e3
 
 @dataclass(frozen=True)
 class Layout:
-    """Which blocks of six belong to what."""
+    """States which blocks of six unknowns belong to images, lenses, mounts and flights, in this order."""
 
     images: int
     cameras: int
@@ -82,8 +82,8 @@ class Equations:
 
     @cached_property
     def undamped(self) -> tuple[sparse.bsr_matrix, FloatArray, sparse.bsr_matrix]:
-        """What is the same whatever the damping, points not eliminated: matrix (6 B, 6 B), right (6 B,) and coupling
-        (6 B, 3 P)."""
+        """Return the parts that do not depend on the damping, points not eliminated: matrix (6 B, 6 B), right-hand side
+        (6 B,) and coupling (6 B, 3 P)."""
         from scipy import sparse
 
         blocks, size = len(self.held), (2 * len(self.by_point), 3 * len(self.point_normals))
@@ -120,7 +120,8 @@ def residuals_in_sigmas(network: Network, state: Unknowns) -> FloatArray:
 
 
 def _apart(network: Network, xy_px: FloatArray) -> FloatArray:
-    """The same of image points (M, 2) that are projected already."""
+    """Return the distances (M,) of image points from where they were measured, in standard deviations. xy_px: (M, 2)
+    projected points, pixels."""
     off = (xy_px - network.xy_px) / network.sigma_px[:, None]
     apart = np.sqrt((off**2).sum(axis=1))
     return np.where(np.isfinite(apart), apart, _BEHIND_SIGMAS)

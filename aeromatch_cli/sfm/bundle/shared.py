@@ -34,7 +34,8 @@ class FlightLens:
 
 
 def lenses_by_flight(network: Network, state: Unknowns, tolerance: float) -> list[FlightLens]:
-    """Of every camera with several flights that each tell of a lens. state: a solution of the network."""
+    """Return a separate lens for every flight of the cameras with several flights that each determine a lens. state: a
+    solution of the network."""
     found = []
     apart = list(_apart(network))
     as_it_is = solve(network, state, tolerance, near=True).cost if apart else 0.0
