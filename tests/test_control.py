@@ -23,7 +23,7 @@ from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.lab.synthetic import load_truth
 from aeromatch_cli.results.adjustment import Control, ControlInGroup
 from aeromatch_cli.sfm.control import control_figures
-from aeromatch_cli.stages import adjust
+from aeromatch_cli.stages import surveyed as control_stage
 from aeromatch_cli.stages.messages import control_words
 
 IMAGES = (Image("a_jpg", "sub/a.jpg", 100, 80, "1"), Image("b_jpg", "b.jpg", 100, 80, "1"))
@@ -173,13 +173,13 @@ def test_points_in_one_place_or_on_one_line_determine_no_transformation(truth: T
 
 
 def test_image_points_that_count_from_below_are_said(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adjust.orient, "groups", lambda _: [])
+    monkeypatch.setattr(control_stage.orient, "groups", lambda _: [])
     images = {image.image_id: image for image in truth.block.images}
 
     def said(points: list[ControlPoint]) -> list[str]:
         context = SimpleNamespace(control=points, block=truth.block, image_by_id=images)
         figures = control_figures(adjusted_truth(truth), cameras(truth), points)
-        return adjust._counted_from_below(context, adjusted_truth(truth), figures)
+        return control_stage.counted_from_below(context, adjusted_truth(truth), figures)
 
     points = surveyed(truth, list(range(0, 400, 50)), np.zeros((8, 3)), set())
     below = [
@@ -317,11 +317,11 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
 def test_control_points_of_another_place_are_said(truth: Truth, offset_m: tuple, words: list[str]) -> None:
     """Given positions have 0.5 m: 10 m is the limit."""
     context = SimpleNamespace(block=truth.block, given=truth.block)
-    said = adjust.control_remarks(context, offset_m)
+    said = control_stage.control_remarks(context, offset_m)
     assert len(said) == len(words)
     assert all(word in line for word, line in zip(words, said, strict=True))
     local = SimpleNamespace(block=replace(truth.block, crs="local"), given=truth.block)
-    assert adjust.control_remarks(local, offset_m) == []
+    assert control_stage.control_remarks(local, offset_m) == []
 
 
 def test_what_control_points_did_in_the_adjustment_is_said() -> None:

@@ -29,8 +29,8 @@ from aeromatch_cli.results.stages import AdjustResult, OrientResult
 from aeromatch_cli.sfm.dem import Terrain
 from aeromatch_cli.sfm.heights import shift_of_points_m, shift_to_control_m
 from aeromatch_cli.sfm.quality import QualityInput, judged
-from aeromatch_cli.stages.adjust import height_remarks
 from aeromatch_cli.stages.ground import judged_ground
+from aeromatch_cli.stages.surveyed import height_remarks
 
 LATITUDE, LONGITUDE = 48.0, 15.0
 GEOID_M = 45.0 + LONGITUDE / 10.0

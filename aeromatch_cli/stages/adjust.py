@@ -5,20 +5,17 @@ Poses, cameras and points go to the workspace's orientation folder, for the expo
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.crs import LOCAL
-from aeromatch_cli.data import AdjustedBlock, ControlPoint, PoseResidual
+from aeromatch_cli.data import AdjustedBlock, PoseResidual
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.files import translated_os_errors, whole_record, write_atomically, write_record, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
-from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.residuals import residuals_text
 from aeromatch_cli.geometry.cameras import BROWN, MODELS, focal_px
 from aeromatch_cli.images.scaling import scale_within
@@ -26,29 +23,21 @@ from aeromatch_cli.results.adjustment import Control, GroupResult
 from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.sfm.block_figures import block_figures
 from aeromatch_cli.sfm.calibration import held_by
-from aeromatch_cli.sfm.control import control_figures
-from aeromatch_cli.sfm.heights import shift_to_control_m, zeros_words
 from aeromatch_cli.sfm.mapping import Group, adjust_block
 from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
 from aeromatch_cli.stages import orient, refine
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
-from aeromatch_cli.stages.simulate import degenerate_view
-from aeromatch_cli.stages.stage_report import StageReport, gather_failures
+from aeromatch_cli.stages.filter import pair_fingerprint
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.surveyed import control_of_block, control_remarks, counted_from_below, height_remarks
+from aeromatch_cli.stages.unregistered import unregistered_reasons
 from aeromatch_cli.stages.versions import library_version
 
 VERSION = 26
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
-# Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
-_FAR_CONTROL_M, _FAR_CONTROL_SIGMAS = 10.0, 5.0
-# Image points of surveyed points count from below where their rays meet so many times better then; and beyond so many
-# pixels.
-_FROM_BELOW, _FROM_BELOW_PX = 5.0, 20.0
 _NOTHING = "not done: no image is oriented; exports have poses only where some are given"
-# An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
-_FEW_KEYPOINTS = 0.1
 
 
 def run(context: Context) -> StageReport:
@@ -169,12 +158,12 @@ def _result(
     residuals: Mapping[str, PoseResidual],
 ) -> AdjustResult:
     """Figures of the whole and of every group, and why images are not oriented."""
-    control = _control(context, adjusted, groups)
+    control = control_of_block(context, adjusted, groups)
     return AdjustResult(
         **block_figures(adjusted, context.block.images, groups),
         positions_given=len(context.given.poses),
         reduced=_reduced(context),
-        outside=_reasons(context, adjusted),
+        outside=unregistered_reasons(context, adjusted),
         held_by=_held_by(context),
         readout_not_tried=readout_not_tried(context, adjusted.poses),
         control=control,
@@ -230,112 +219,4 @@ def _remarks(
     remarks += height_remarks(groups)
     if control is None:
         return remarks
-    return remarks + (_counted_from_below(context, adjusted, control) or control_remarks(context, control.offset_m))
-
-
-def height_remarks(groups: Sequence[GroupResult]) -> list[str]:
-    """Say which heights of positions lie above or below those of the control points, all by as much."""
-    shifts_m = [up_m for group in groups if (up_m := shift_to_control_m(group)) is not None]
-    return [
-        f"heights of the given positions lie {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} those of the control "
-        f"points, everywhere by about as much: {zeros_words(up_m)}; the block has the heights of the control points"
-        for up_m in shifts_m
-    ]
-
-
-def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[str]:
-    """Say which control points lie far from where the given positions of the images put them."""
-    if offset_m is None or context.block.crs == LOCAL:
-        return []
-    east_m, north_m, up_m = offset_m
-    across_m = float(np.hypot(east_m, north_m))
-    sigmas_m = [pose.sigma_position_m for pose in context.given.poses.values()]
-    sigma_m = float(np.median(sigmas_m)) if sigmas_m else 0.0
-    limit_m = max(_FAR_CONTROL_M, _FAR_CONTROL_SIGMAS * sigma_m)
-    if across_m > limit_m:
-        return [
-            f"the control points lie {across_m:,.0f} m beside where the given positions of the images put them: is the "
-            "CRS in the first line of their file right, or are x and y exchanged?"
-        ]
-    if abs(up_m) > limit_m:
-        return [
-            f"the control points lie {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} the heights at which the "
-            "given positions of the images put them: do both count from the same zero (ellipsoid, sea level)?"
-        ]
-    return []
-
-
-def _control(context: Context, adjusted: AdjustedBlock, groups: Sequence[GroupResult]) -> Control | None:
-    """The block beside surveyed points, without those that the adjustment has found wrong or exchanged."""
-    if not context.control:
-        return None
-    found = [group.control for group in groups if group.control is not None]
-    left_out = {name for one in found for name in (*one.wrong, *one.exchanged)}
-    return _control_figures(context, adjusted, [point for point in context.control if point.name not in left_out])
-
-
-def _control_figures(context: Context, adjusted: AdjustedBlock, points: Sequence[ControlPoint]) -> Control:
-    cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
-    # Images that no position has placed lie beside the others: their rays meet those at no surveyed point.
-    beside = {i for group in orient.groups(context) if group.kind == "level" for i in group.images}
-    placed = {i: pose for i, pose in adjusted.poses.items() if i not in beside} or adjusted.poses
-    return control_figures(replace(adjusted, poses=placed), cameras, points, metric=context.block.metric)
-
-
-def _counted_from_below(context: Context, adjusted: AdjustedBlock, control: Control) -> list[str]:
-    """Say that the y of image points of surveyed points counts from the lower edge of the picture, where it does."""
-    images = context.image_by_id
-    turned = [
-        replace(point, pixels={i: np.array([x, images[i].height_px - 1.0 - y]) for i, (x, y) in point.pixels.items()})
-        for point in context.control
-    ]
-    as_given_px, turned_px = (
-        control.reprojection_error_px,
-        _control_figures(context, adjusted, turned).reprojection_error_px,
-    )
-    if as_given_px is None or turned_px is None or as_given_px < max(_FROM_BELOW * turned_px, _FROM_BELOW_PX):
-        return []
-    return [
-        f"rays of surveyed points meet to {as_given_px:.0f} px, and to {turned_px:.1f} px if y in their list counts "
-        "from the lower edge of the pictures: it has to count from the upper edge, correct the list"
-    ]
-
-
-def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
-    """image_id -> why it is not oriented."""
-    outside = [i.image_id for i in context.block.images if i.image_id not in adjusted.poses]
-    if not outside:
-        return {}
-    pairs = Counter(i for p in context.pairs for i in (p.image_id0, p.image_id1))
-    verified: Counter[str] = Counter()
-    tied: Counter[str] = Counter()
-    for pair, entry in verified_pairs(context):
-        if entry.verdict.state == "verified":
-            ends = pair.image_id0, pair.image_id1
-            verified.update(ends)
-            tied.update(i for i in ends if any(other in adjusted.poses for other in ends if other != i))
-    keypoints = {
-        image.image_id: len(read_keypoints(path)[0]) if (path := context.workspace.features(image.image_id)).exists()
-        else 0 for image in context.block.images
-    }  # fmt: skip
-    usual = float(np.median(list(keypoints.values())))
-    unread = {item: why for stage, item, why in gather_failures(context.workspace) if stage == "extract"}
-    reasons = {}
-    for image_id in outside:
-        count = keypoints[image_id]
-        if image_id in unread:
-            reasons[image_id] = f"no features: {unread[image_id]}"
-        elif count <= _FEW_KEYPOINTS * usual:
-            seen = degenerate_view(context.workspace, context.image_by_id[image_id]) or "no texture, or blurred"
-            reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: {seen}"
-        elif not pairs[image_id]:
-            reasons[image_id] = "in no pair: it overlaps no other image"
-        elif not verified[image_id]:
-            reasons[image_id] = f"none of its {pairs[image_id]} pairs could be verified"
-        elif not adjusted.poses:
-            reasons[image_id] = f"no image could be oriented ({verified[image_id]} verified pairs of this one)"
-        elif not tied[image_id]:
-            reasons[image_id] = f"its {verified[image_id]} verified pairs are with images that are not oriented either"
-        else:
-            reasons[image_id] = f"too few points in common with oriented images ({tied[image_id]} verified pairs)"
-    return reasons
+    return remarks + (counted_from_below(context, adjusted, control) or control_remarks(context, control.offset_m))

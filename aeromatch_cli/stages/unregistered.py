@@ -1,0 +1,57 @@
+"""Why images are not oriented: what they lack, from their keypoints to points in common with oriented images."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.filter import verified_pairs
+from aeromatch_cli.stages.simulate import degenerate_view
+from aeromatch_cli.stages.stage_report import gather_failures
+
+# An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
+_FEW_KEYPOINTS = 0.1
+
+
+def unregistered_reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
+    """image_id -> why it is not oriented."""
+    outside = [i.image_id for i in context.block.images if i.image_id not in adjusted.poses]
+    if not outside:
+        return {}
+    pairs = Counter(i for p in context.pairs for i in (p.image_id0, p.image_id1))
+    verified: Counter[str] = Counter()
+    tied: Counter[str] = Counter()
+    for pair, entry in verified_pairs(context):
+        if entry.verdict.state == "verified":
+            ends = pair.image_id0, pair.image_id1
+            verified.update(ends)
+            tied.update(i for i in ends if any(other in adjusted.poses for other in ends if other != i))
+    keypoints = {
+        image.image_id: len(read_keypoints(path)[0]) if (path := context.workspace.features(image.image_id)).exists()
+        else 0 for image in context.block.images
+    }  # fmt: skip
+    usual = float(np.median(list(keypoints.values())))
+    unread = {item: why for stage, item, why in gather_failures(context.workspace) if stage == "extract"}
+    reasons = {}
+    for image_id in outside:
+        count = keypoints[image_id]
+        if image_id in unread:
+            reasons[image_id] = f"no features: {unread[image_id]}"
+        elif count <= _FEW_KEYPOINTS * usual:
+            seen = degenerate_view(context.workspace, context.image_by_id[image_id]) or "no texture, or blurred"
+            reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: {seen}"
+        elif not pairs[image_id]:
+            reasons[image_id] = "in no pair: it overlaps no other image"
+        elif not verified[image_id]:
+            reasons[image_id] = f"none of its {pairs[image_id]} pairs could be verified"
+        elif not adjusted.poses:
+            reasons[image_id] = f"no image could be oriented ({verified[image_id]} verified pairs of this one)"
+        elif not tied[image_id]:
+            reasons[image_id] = f"its {verified[image_id]} verified pairs are with images that are not oriented either"
+        else:
+            reasons[image_id] = f"too few points in common with oriented images ({tied[image_id]} verified pairs)"
+    return reasons
