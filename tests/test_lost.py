@@ -10,8 +10,8 @@ from make_results import filled
 
 from aeromatch_cli.cli.output import guarded
 from aeromatch_cli.results.stages import BlockResults
+from aeromatch_cli.stages.command_result import Result
 from aeromatch_cli.stages.lost import lost_images, lost_lines, write_lost
-from aeromatch_cli.stages.run import Result
 from aeromatch_cli.workspace import Workspace
 
 NAMES = {f"a{k}_jpg": f"a{k}.jpg" for k in range(8)}

@@ -8,7 +8,7 @@ import pytest
 from conftest import Site, invoke
 
 from aeromatch_cli.cli.output import guarded
-from aeromatch_cli.stages.run import Result
+from aeromatch_cli.stages.command_result import Result
 
 
 def exit_code(*, strict: bool, **result: Any) -> int:

@@ -15,7 +15,7 @@ from aeromatch_cli.cli.progress import ProgressKind, progress_shown
 from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
-    from aeromatch_cli.stages.run import Result
+    from aeromatch_cli.stages.command_result import Result
 
 EXAMPLES: Mapping[str, Sequence[str]] = {
     "evaluate": (
@@ -69,7 +69,7 @@ def evaluate(
         from aeromatch_cli.evaluate import evaluate_workspace
         from aeromatch_cli.evaluate.output import facts, lines, refresh_report, write_evaluation
         from aeromatch_cli.lab.opening import open_truth
-        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.stages.command_result import Result
 
         shown = progress_shown(progress, quiet=quiet)
         evaluation = evaluate_workspace(work, truth, open_truth, mapping=mapping, progress=shown)
@@ -109,8 +109,8 @@ def frames(
 
     def call() -> Result:
         from aeromatch_cli.executor import Executor
+        from aeromatch_cli.stages.command_result import Result
         from aeromatch_cli.stages.frames import write_frames
-        from aeromatch_cli.stages.run import Result
 
         with Executor("serial", 1, progress_shown(progress, quiet=quiet)) as executor:
             lines, facts = write_frames(video, out, executor, track=track, start=start, overlap=overlap)
@@ -160,7 +160,7 @@ def synth(
 
     def call() -> Result:
         from aeromatch_cli.lab.synthetic import render_block
-        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.stages.command_result import Result
 
         width_px, height_px = _parse_size(size)
         summary = render_block(

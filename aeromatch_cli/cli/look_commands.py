@@ -15,7 +15,7 @@ from aeromatch_cli.cli.output import guarded
 from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
-    from aeromatch_cli.stages.run import Result
+    from aeromatch_cli.stages.command_result import Result
 
 EXAMPLES: Mapping[str, Sequence[str]] = {
     "show": (
@@ -65,7 +65,7 @@ def show(
         from aeromatch_cli.config import Settings
         from aeromatch_cli.report.show import show as shown
         from aeromatch_cli.report.tiles import SUFFIXES
-        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.stages.command_result import Result
 
         names = images or []
         given = os.environ.get("AEROMATCH_WORKSPACE")
@@ -100,7 +100,7 @@ def compare(
 
     def call() -> Result:
         from aeromatch_cli.report.compare import compare as compared
-        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.stages.command_result import Result
 
         lines, facts = compared(first, second)
         return Result(tuple(lines), facts)
@@ -120,7 +120,7 @@ def config(
     def call() -> Result:
         from aeromatch_cli.config import load
         from aeromatch_cli.config.overview import whole_settings
-        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.stages.command_result import Result
 
         tree = load(source or DEFAULT_PRESET, set_ or ()).model_dump(mode="json")
         return Result(tuple(whole_settings(tree).splitlines()), {"settings": tree})
@@ -140,7 +140,7 @@ def list_(
 
     def call() -> Result:
         from aeromatch_cli.config.overview import choices, listing
-        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.stages.command_result import Result
 
         return Result(tuple(listing(family)), choices(family))
 
@@ -160,7 +160,7 @@ def init(
         from aeromatch_cli.config.overview import first_settings
         from aeromatch_cli.files import write_text
         from aeromatch_cli.images.remote import is_remote
-        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.stages.command_result import Result
 
         if images is None:
             raise ConfigError("no images: give --images DIR")

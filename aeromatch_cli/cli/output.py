@@ -23,7 +23,7 @@ from aeromatch_cli.cli.log import logged_to, record
 from aeromatch_cli.errors import AeromatchError, lacks_memory
 
 if TYPE_CHECKING:
-    from aeromatch_cli.stages.run import Result
+    from aeromatch_cli.stages.command_result import Result
 
 EXIT_SOME_FAILED = 1
 EXIT_DOUBTFUL = 4

@@ -44,7 +44,7 @@ from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
     from aeromatch_cli.config.schema import BlockSettings
-    from aeromatch_cli.stages.run import Result
+    from aeromatch_cli.stages.command_result import Result
 
 # Commands that start anew where no preset is named.
 _WHOLE = ("run", "check")

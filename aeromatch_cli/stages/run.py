@@ -5,22 +5,20 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from aeromatch_cli import graph, report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.files import read_json, remove_stale_temporaries, translated_os_errors, whole_record
+from aeromatch_cli.files import remove_stale_temporaries, translated_os_errors
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
-from aeromatch_cli.results.stages import ExportResult, FilterResult, PairsResult, ReportResult
-from aeromatch_cli.sfm.quality import Level
+from aeromatch_cli.results.stages import FilterResult
 from aeromatch_cli.stages import (
     adjust,
     cascade,
@@ -38,15 +36,19 @@ from aeromatch_cli.stages import (
     union,
     up_to_date,
 )
+from aeromatch_cli.stages.command_result import (
+    JUDGED,
+    Result,
+    Said,
+    all_failures,
+    block_of,
+    command_result,
+    named,
+)
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.lost import Lost, lost_images, lost_lines, write_lost
-from aeromatch_cli.stages.messages import stage_lines
-from aeromatch_cli.stages.naming import item_named, names_on_file, with_names
-from aeromatch_cli.stages.quality import quality_of, results_of
-from aeromatch_cli.stages.result_summary import closing_lines, verdict_lines
 from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
-from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
+from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import Workspace, locked
 
 log = logging.getLogger("aeromatch")
@@ -62,20 +64,6 @@ FUNCTIONS: dict[str, Callable[[Context], StageReport]] = {
 _AFTER_CASCADE = ("match", "filter", "adjust", "export", "report")
 # Commands that export, and the one that says what they would do.
 _EXPORTING = ("run", "export", "check")
-
-
-@dataclass(frozen=True)
-class Result:
-    """Holds what a command says: lines for people, facts for machines; failures, and the verdict on the block where
-    there is one, for the exit code. urgent: those of the lines that are said even where quiet is asked for. reports: of
-    the stages."""
-
-    lines: tuple[str, ...]
-    facts: dict[str, Any] = field(default_factory=dict)
-    failures: tuple[tuple[str, str, str], ...] = ()
-    verdict: Level | None = None
-    urgent: tuple[str, ...] = ()
-    reports: tuple[StageReport, ...] = ()
 
 
 def execute(
@@ -106,13 +94,13 @@ def execute(
             inputs = up_to_date.state_of_inputs(settings) if whole else {}
             before = None if overwrite else up_to_date.unchanged_reports(Workspace(root), inputs)
             if before is not None:
-                return _named(_unchanged(settings, before, _Said(say)), root)
+                return named(_unchanged(settings, before, Said(say)), root)
             run = settings.run
             with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
-                result = _repairing(command, settings, executor, part, overwrite, _Said(say))
+                result = _repairing(command, settings, executor, part, overwrite, Said(say))
             if whole and not result.failures:
                 up_to_date.remember(Workspace(root), inputs, result.reports)
-            return _named(result, root)
+            return named(result, root)
         except BaseException as error:
             # Workers are stopped in the middle of what they write.
             if command != "check":
@@ -123,22 +111,15 @@ def execute(
             raise
 
 
-def _named(result: Result, root: Path) -> Result:
-    """Return the result as people and other programs get it: with names of files in place of image ids."""
-    names = names_on_file(Workspace(root))
-    failures = tuple((stage, item_named(item, names), reason) for stage, item, reason in result.failures)
-    return replace(result, facts=with_names(result.facts, names), failures=failures)
-
-
-def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> Result:
+def _unchanged(settings: Settings, reports: list[StageReport], said: Said) -> Result:
     """Return the result of a whole run that has nothing to do."""
     workspace = Workspace(Path(settings.workspace).absolute())
     names = {image.image_id: image.name for image in read_images(workspace.images)}
-    block = _block_of(reports)
+    block = block_of(reports)
     for line in block.summary:
         said(line)
     pairs.warn(block.warnings, block.urgent)
-    return _result("run", settings, workspace, names, reports, (), said)
+    return command_result("run", settings, workspace, names, reports, (), said)
 
 
 @contextmanager
@@ -160,23 +141,8 @@ def _nothing_left_of_a_failed_start(workspace: Workspace, *, shared: bool) -> It
         raise
 
 
-class _Said:
-    """Lines that were said already, each once; all of them wait for the result where nobody listens."""
-
-    def __init__(self, say: Callable[[str], None] | None) -> None:
-        self._say, self._said = say, set[str]()
-
-    def __call__(self, line: str) -> None:
-        if self._say is not None and line not in self._said:
-            self._say(line)
-            self._said.add(line)
-
-    def rest(self, lines: Iterable[str]) -> list[str]:
-        return [line for line in lines if line not in self._said]
-
-
 def _repairing(
-    command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: _Said
+    command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: Said
 ) -> Result:
     """Repeats the command until it meets no damaged file; each one is deleted, so that it is made again."""
     repaired: set[str] = set()
@@ -196,10 +162,6 @@ def _repairing(
                 Path(error.path).unlink(missing_ok=True)
 
 
-# Commands that end with a verdict on the block.
-_JUDGED = ("run", "adjust")
-
-
 def _makes(command: str, workspace: Workspace, path: Path) -> bool:
     """Whether a command makes a file of the workspace."""
     below = path.absolute().relative_to(workspace.root.absolute())
@@ -207,7 +169,7 @@ def _makes(command: str, workspace: Workspace, path: Path) -> bool:
 
 
 def _attempt(
-    command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: _Said
+    command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: Said
 ) -> Result:
     dry = command == "check"
     workspace = Workspace(Path(settings.workspace))
@@ -240,10 +202,13 @@ def _attempt(
             "(`aeromatch run` does everything)"
         )
     names = {image.image_id: image.name for image in context.block.images}
-    failures = _all_failures(command, context, reports)
-    return _result(
-        command, context.settings, context.workspace, names, reports, failures, said, part=context.shard is not None
-    )
+    failures = all_failures(command, context, reports)
+    page = context.workspace.report
+    old_page = command in JUDGED and page.is_file() and _current_page(context.workspace, settings=False) is None
+    return command_result(
+        command, context.settings, context.workspace, names, reports, failures, said,
+        part=context.shard is not None, old_page=old_page,
+    )  # fmt: skip
 
 
 def _there(settings: Settings) -> bool:
@@ -284,7 +249,8 @@ def _run_all(context: Context) -> list[StageReport]:
                 f"no pair could be verified: the table of pairs in {context.workspace.report} says why"
                 + _without_keypoints(context)
             )
-        reports += [FUNCTIONS[name](context) for name in ("refine", "adjust", "consistency", "export")]
+        after = graph.RUN[graph.RUN.index("filter") + 1 :]
+        reports += [FUNCTIONS[name](context) for name in after if name != "report"]
         if context.settings.run.report:
             reports.append(_page(context))
     return reports
@@ -331,103 +297,9 @@ def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:
     return context, [features, match.run(context), filter.run(context)]
 
 
-def _result(
-    command: str,
-    settings: Settings,
-    workspace: Workspace,
-    names: Mapping[str, str],
-    reports: list[StageReport],
-    failures: tuple[tuple[str, str, str], ...],
-    said: _Said,
-    *,
-    part: bool = False,
-) -> Result:
-    """names: of the files, by image_id. part: of a shard."""
-    first = next(report for report in reports if report.stage == "pairs")
-    lines = said.rest(_block_of(reports).summary)
-    for stage in reports:
-        lines += stage_lines(stage, names, part=part)
-    results = results_of(workspace, reports)
-    quality = quality_of(results, names) if command in _JUDGED and not part else None
-    lost, urgent = list[Lost](), list[str]()
-    if quality is not None:
-        unread = [*first.failures, *_block_of(reports).unread.items()]
-        lost = lost_images(results, unread, names)
-        write_lost(workspace, lost)
-        told_lost = lost_lines(workspace, lost, len(names) + len(unread))
-        lines += [*closing_lines(quality, results, names), *told_lost]
-        urgent = [*([] if quality.verdict == "good" else verdict_lines(quality)), *told_lost]
-    lines.append(f"workspace {workspace.root}")
-    if reports[-1].stage == "report":
-        lines.append(f"report    {workspace.report}")
-    elif command in _JUDGED and workspace.report.is_file() and _current_page(workspace, settings=False) is None:
-        lines.append(f"report    {workspace.report} is of an earlier run: `aeromatch report` makes it anew")
-    if command not in ("run", "export") and workspace.export_is_older:
-        lines += [
-            f"export    {folder} is of an earlier adjustment: `aeromatch export` makes it anew"
-            for folder in workspace.exported()
-        ]
-    if command in ("run", "export") and not part:
-        written = next((r.result.exporters for r in reports if isinstance(r.result, ExportResult)), {})
-        lines += [f"export    {workspace.export(e.name)}" for e in settings.export if e.name in written]
-        lines += [f"export    {folder} is of earlier settings, not made anew" for folder in _left(workspace, settings)]
-    if failures:
-        lines.append(f"{len(failures)} failed, listed in {workspace.failures}")
-        urgent.append(lines[-1])
-    facts = {
-        "workspace": str(workspace.root),
-        "stages": _stage_facts(reports),
-        "failures": len(failures),
-    }
-    if quality is not None:
-        facts["quality"] = quality.as_facts()
-        facts["lost"] = {name: reason for name, _, reason in lost}
-    verdict = None if quality is None else quality.verdict
-    return Result(tuple(lines), facts, failures, verdict, tuple(urgent), tuple(reports))
-
-
-def _block_of(reports: Sequence[StageReport]) -> PairsResult:
-    """Return the result of the stage pairs; every command runs it."""
-    return next(report.result for report in reports if isinstance(report.result, PairsResult))
-
-
-def _left(workspace: Workspace, settings: Settings) -> list[Path]:
-    """Folders of exporters that the settings no longer name."""
-    wanted = {exporter.name for exporter in settings.export}
-    return [folder for folder in workspace.exported() if folder.name not in wanted]
-
-
-def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:
-    """Return the facts of the stages by name; those of the steps of a shard's cascade are below the key `steps`, by
-    step."""
-    found: dict[str, Any] = {}
-    for r in reports:
-        step = r.part.removeprefix("step ").removesuffix(": ")
-        stages = found.setdefault("steps", {}).setdefault(step, {}) if step else found
-        stages[r.stage] = {
-            "items": r.items,
-            "done": r.done,
-            "skipped": r.skipped,
-            "failed": len(r.failures),
-            "seconds": r.seconds,
-            "result": None if r.result is None else r.result.as_json(),
-        }
-    return found
-
-
-def _all_failures(command: str, context: Context, reports: list[StageReport]) -> tuple[tuple[str, str, str], ...]:
-    """Return what failed now, and what failed in the stages before this command and still stands."""
-    failures = {(r.stage, item, reason) for r in reports for item, reason in r.failures}
-    before = graph.RUN if command == "run" else graph.RUN[: graph.RUN.index(command)] if command in graph.RUN else ()
-    for stage, item, reason in gather_failures(context.workspace):
-        if stage in before and context.owns(owner(item)):
-            failures.add((stage, item, reason))
-    return tuple(sorted(once(failures)))
-
-
-def _check(context: Context, oriented: StageReport, first: StageReport, said: _Said) -> Result:
+def _check(context: Context, oriented: StageReport, first: StageReport, said: Said) -> Result:
     settled = oriented.result is not None or context.settings.first_pass is None
-    read, quality = _block_of([first]), picture_quality.measured(context)
+    read, quality = block_of([first]), picture_quality.measured(context)
     looks = picture_quality.remarks(context, quality)
     pairs.warn(warning for warning in looks if warning not in read.warnings)
     found = check.run(context, time.perf_counter() - first.started, len(first.failures), oriented=settled)

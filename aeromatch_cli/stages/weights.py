@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from aeromatch_cli.stages.run import Result
+from aeromatch_cli.stages.command_result import Result
 
 
 def manage_weights(action: str, path: str | None) -> Result:
