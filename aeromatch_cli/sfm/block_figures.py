@@ -19,7 +19,7 @@ _FEW_POINTS = 20
 
 
 def block_figures(adjusted: AdjustedBlock, images: Iterable[Image], groups: Sequence[GroupResult]) -> dict[str, Any]:
-    """Fields of AdjustResult. groups: the results of each."""
+    """Return fields of AdjustResult that describe the block as a whole. groups: the results of each."""
     placed = [pose for image_id, pose in adjusted.poses.items() if image_id not in adjusted.frames]
     seen = images_per_point(adjusted)
     held = [int((seen[track[:, 1]] >= 3).sum()) for track in adjusted.tracks.values()]
@@ -45,7 +45,7 @@ def block_figures(adjusted: AdjustedBlock, images: Iterable[Image], groups: Sequ
 
 
 def images_per_point(adjusted: AdjustedBlock) -> IntArray:
-    """(P,)."""
+    """Count the images that see each point of the block, (P,)."""
     seen = np.zeros(len(adjusted.points_m), dtype=np.int64)
     for track in adjusted.tracks.values():
         seen[np.unique(track[:, 1])] += 1
@@ -53,8 +53,8 @@ def images_per_point(adjusted: AdjustedBlock) -> IntArray:
 
 
 def tied_parts(adjusted: AdjustedBlock) -> list[int]:
-    """Sizes of the parts of the block within which images are connected by pairs that share 20 points, the largest
-    first."""
+    """Return the sizes of the parts of the block within which images are connected by pairs that share 20 points, the
+    largest first."""
     from scipy import sparse
 
     tracks = [np.unique(track[:, 1]) for track in adjusted.tracks.values()]

@@ -40,7 +40,7 @@ class LensPrior:
 
 
 def lens_of(camera: Camera) -> FloatArray:
-    """(12,) values by `network.LENS`."""
+    """Return the values (12,) of a camera by `network.LENS`."""
     values = dict.fromkeys(LENS, 0.0)
     if is_fisheye(camera):
         p = parameters(camera)
@@ -52,7 +52,8 @@ def lens_of(camera: Camera) -> FloatArray:
 
 
 def camera_of(lens: FloatArray, given: Camera) -> Camera:
-    """The camera of these values (12,): of the given one's model where that holds them exactly, else of BROWN."""
+    """Return the camera of these values (12,): of the given one's model where that holds them exactly, else of
+    BROWN."""
     values = dict(zip(LENS, (float(value) for value in lens), strict=True))
     if is_fisheye(given):
         named = {**values, "fx": values["f"] + values["b1"], "fy": values["f"], "k4": values["p1"]}
@@ -87,7 +88,7 @@ def lens_prior(camera: Camera, focal_sigma: float) -> LensPrior:
 
 
 def freed(prior: LensPrior, calibration: Calibration, switches: Mapping[str, bool], images: int) -> FloatArray:
-    """(12,) standard deviations of the unknowns, 0 where one is held.
+    """Return the standard deviations (12,) of the unknowns, 0 where one is held.
 
     calibration: "given" holds all, "focal" all but the focal length; "brown" frees all, whatever the block says of
     them; "auto" leaves it to the adjustment. switches: by name, what is free or held in any case. images: that the

@@ -28,7 +28,7 @@ _STEP = 1e-5
 def control_figures(
     adjusted: AdjustedBlock, cameras: Mapping[str, Camera], points: Sequence[ControlPoint], *, metric: bool = True
 ) -> Control:
-    """The similarity from the adjusted block to surveyed points, and errors at them.
+    """Return the similarity from the adjusted block to surveyed points, and errors at them.
 
     cameras: image_id -> adjusted camera. metric: whether lengths of the block are metres. Errors are determined at the
     check points; without any, at every control point under the transformation of the others (leave-one-out). Without
@@ -157,7 +157,8 @@ def _rays(adjusted: AdjustedBlock, cameras: Mapping[str, Camera], point: Control
 
 
 def intersected(centers_m: FloatArray, rays: FloatArray) -> FloatArray | None:
-    """World point (3,) nearest to the rays; None below two, where they are parallel or meet behind a camera."""
+    """Return the world point (3,) nearest to the rays; None below two, where they are parallel or meet behind a
+    camera."""
     if len(rays) < 2 or not np.isfinite(rays).all():
         return None
     across = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)

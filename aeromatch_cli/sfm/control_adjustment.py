@@ -69,8 +69,8 @@ class Surveyed:
 def with_control(
     work: Work, model: Any, outcome: Outcome, surveyed: Sequence[Surveyed]
 ) -> tuple[Outcome, ControlInGroup | None]:
-    """The block adjusted once more with control points, where that makes held-out points better; and what was found,
-    None where no point is measured in two images."""
+    """Return the block adjusted once more with control points, where that makes held-out points better; and what was
+    found, None where no point is measured in two images."""
     images = set(outcome.images)
     base = _Block(outcome.result.network, outcome.result.state, outcome)
     seen = [point for point in surveyed if point.seen_by(images) >= 2 and np.isfinite(base.error_m(point)).all()]

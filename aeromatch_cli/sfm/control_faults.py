@@ -27,7 +27,7 @@ _FAULTS: tuple[tuple[str, FloatArray], ...] = (
 
 
 def fault_of_list(found_m: FloatArray, stated_m: FloatArray) -> str:
-    """The fault that explains why points (N, 3) do not lie where they were surveyed, "" where none does.
+    """Return the fault that explains why points (N, 3) do not lie where they were surveyed, "" where none does.
 
     found_m: where the block has them, metres. Whatever all have in common, such as another zero of heights, is no fault
     of this kind.

@@ -56,8 +56,8 @@ class Recognised:
 def recognised(
     given: Mapping[str, Angles], found: Mapping[str, FloatArray], north_sigma_deg: float = 0.0
 ) -> Recognised | None:
-    """The reading of the given angles that explains the attitudes found; None where they agree as they are, or none
-    does.
+    """Return the reading of the given angles that explains the attitudes found; None where they agree as they are, or
+    none does.
 
     found: image_id -> (3, 3) cam_from_world, in the world frame by positions. north_sigma_deg: how exactly these say
     where north is.

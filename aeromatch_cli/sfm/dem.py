@@ -73,7 +73,8 @@ def ground_points(
     cameras: Mapping[str, Camera],
     limits_px: Mapping[str, float],
 ) -> GroundPoints:
-    """The matches of posed pairs in space, without those that the poses contradict or whose rays are near-parallel.
+    """Return the matches of posed pairs in space, without those that the poses contradict or whose rays are
+    near-parallel.
 
     cameras, limits_px: by image_id; the second are the largest errors of right matches, stored pixels.
     """
@@ -117,7 +118,7 @@ class Terrain:
 
 
 def terrain_of(points: GroundPoints, centers_m: FloatArray) -> Terrain | None:
-    """Heights below a flight, None from too few points.
+    """Return heights below a flight, None from too few points.
 
     centers_m: (N, 3) projection centres, which the grid must enclose (the points are enclosed in any case). A cell's
     height is the median of the points nearest to its centre, weighted by their standard deviations, so that the surface
@@ -156,7 +157,8 @@ def _weighted_medians(values: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def terrains_of(parts: Sequence[tuple[GroundPoints, FloatArray]]) -> tuple[Terrain, ...]:
-    """Terrains of flights that may lie anywhere, in the order of the first of them: one for all that lie together.
+    """Return terrains of flights that may lie anywhere, in the order of the first of them: one for all that lie
+    together.
 
     parts: of every group of images, its points and its projection centres (N, 3). Flights far apart in one grid would
     have cells as wide as a valley.
@@ -186,7 +188,8 @@ def _meet(centers0_m: FloatArray, centers1_m: FloatArray) -> bool:
 
 
 def continued(old: Terrain, new: Terrain, centers_m: FloatArray) -> Terrain:
-    """The old terrain of a block that has grown, with heights of the new one around it; the new one where they differ.
+    """Return the old terrain of a block that has grown, with heights of the new one around it; the new one where they
+    differ.
 
     centers_m: (N, 3) projection centres. Cells of the old terrain keep their places and heights, so that views made of
     it stay as they are.

@@ -35,7 +35,8 @@ class Before:
 
 
 def arranged(models: Sequence[Model], before: Before) -> list[tuple[Model, dict[str, Pose]]]:
-    """Every model where it is to lie, and those of its images that keep the poses of `before`; in the same order.
+    """Return every model where it is to lie, and those of its images that keep the poses of `before`; in the same
+    order.
 
     Models that no position places ("level") lie east of the placed ones, side by side.
     """

@@ -41,7 +41,7 @@ class PairPoints:
 def explained_share(
     pair: PairPoints, poses: Mapping[str, Pose], cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]
 ) -> float:
-    """Share of a pair's matches that both given poses explain, 0 where one has no attitude."""
+    """Return the share of a pair's matches that both given poses explain, 0 where one has no attitude."""
     explained = explained_matches(pair, poses, cameras, thresholds_px)
     return float(explained.mean()) if len(explained) else 0.0
 
@@ -74,7 +74,7 @@ def explained_images(
     cameras: Mapping[str, Camera],
     thresholds_px: Mapping[str, float],
 ) -> set[str]:
-    """Images whose given poses explain what they share with each other.
+    """Return images whose given poses explain what they share with each other.
 
     thresholds_px: by image_id, the error of an exact match in stored pixels.
     """
@@ -86,7 +86,8 @@ def explained_images(
 
 
 def grouped_images(good: Mapping[tuple[str, str], bool], matches: Mapping[tuple[str, str], int]) -> set[str]:
-    """Images grouped by pairs that hold: the largest group, and each further one that contradicts none before it.
+    """Return images grouped by pairs that hold: the largest group, and each further one that contradicts none before
+    it.
 
     good: whether a pair of images holds. matches: how many it has. Few of them across, beside many within a group, are
     of places that look alike.
@@ -103,7 +104,7 @@ def grouped_images(good: Mapping[tuple[str, str], bool], matches: Mapping[tuple[
 def triangulated(
     pairs: Sequence[PairPoints], poses: Mapping[str, Pose], cameras: Mapping[str, Camera]
 ) -> list[FloatArray]:
-    """World points (M, 3) of the matches of every pair; NaN where a pose is unknown or the angle is too flat."""
+    """Return world points (M, 3) of the matches of every pair; NaN where a pose is unknown or the angle is too flat."""
     found = []
     for pair in pairs:
         found.append(np.full((len(pair.indices), 3), np.nan))
@@ -131,7 +132,7 @@ def heights_above_m(given: Ground, terrain: Ground, centers_m: FloatArray) -> tu
 
 
 def attitude_errors_deg(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, float]:
-    """image_id -> angle in degrees between its given attitude and the one found, where both exist."""
+    """Return image_id -> angle in degrees between its given attitude and the one found, where both exist."""
     errors = {}
     for image_id, pose in found.items():
         before = given.get(image_id)
@@ -142,6 +143,6 @@ def attitude_errors_deg(given: Mapping[str, Pose], found: Mapping[str, Pose]) ->
 
 
 def position_errors_m(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, float]:
-    """image_id -> distance in metres between its given position and the one found, where both exist."""
+    """Return image_id -> distance in metres between its given position and the one found, where both exist."""
     both = given.keys() & found.keys()
     return {i: float(np.linalg.norm(given[i].center_m - found[i].center_m)) for i in sorted(both)}

@@ -36,7 +36,7 @@ def better_cameras(
     thresholds_px: Mapping[str, float],
     likely_px: Mapping[str, float],
 ) -> dict[str, Camera]:
-    """camera_id -> camera with another focal length, for those whose own cannot be right; most often none.
+    """Return camera_id -> camera with another focal length, for those whose own cannot be right; most often none.
 
     poses: image_id -> given pose. cameras: by camera_id. camera_ids, thresholds_px (error of an exact match, stored
     pixels): by image_id. likely_px: camera_id -> focal length that EXIF speaks for, of cameras that contradict it.
@@ -67,7 +67,7 @@ def better_cameras(
 
 
 def with_focal_length(camera: Camera, wanted_px: float) -> Camera:
-    """The camera with another focal length, and what else it has."""
+    """Return the camera with another focal length, and what else it has."""
     factor = wanted_px / focal_px(camera)
     named = zip(MODELS[camera.model], camera.params, strict=True)
     params = tuple(value * factor if name in ("f", "fx", "fy", "b1", "b2") else value for name, value in named)

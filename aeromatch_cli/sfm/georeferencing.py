@@ -99,7 +99,7 @@ def place(
     sigmas_m: FloatArray,
     ups: FloatArray | None = None,
 ) -> Placement:
-    """The similarity from a model to the world.
+    """Return the similarity from a model to the world.
 
     centers: (N, 3) projection centres in the model; points: (P, 3) its points; positions_m: (N, 3) given positions in
     the world, NaN where there is none; sigmas_m: (N,) their standard deviations. ups: (N, 3) unit vectors upwards in
@@ -142,7 +142,7 @@ def height_steps_m(
     ups: FloatArray,
     flights: IntArray,
 ) -> FloatArray:
-    """(N,) by how much the given heights of an image's flight lie above those of the flight of most images.
+    """Return by how much (N,) the given heights of an image's flight lie above those of the flight of most images.
 
     Two batteries, two zeros of the barometer or the receiver: between parallel strips such a step tilts the block. It
     is taken for one where the measured tilts agree with each other, contradict the positions, and agree with them once
@@ -259,7 +259,8 @@ def _vertical(by_terrain: _Vertical, ups: FloatArray | None) -> _Vertical:
 
 
 def similarity(source: FloatArray, target: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Scale, rotation (3, 3) and translation (3,) that take source (N, 3) to target (N, 3) best (Umeyama 1991)."""
+    """Return scale, rotation (3, 3) and translation (3,) that take source (N, 3) to target (N, 3) best (Umeyama
+    1991)."""
     middle0, middle1 = source.mean(axis=0), target.mean(axis=0)
     u, strengths, vt = np.linalg.svd((target - middle1).T @ (source - middle0))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])

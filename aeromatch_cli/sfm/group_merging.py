@@ -54,7 +54,7 @@ class Part:
 
 
 def joined(parts: Sequence[Part], matches: Mapping[tuple[int, int], IntArray]) -> list[Part]:
-    """Parts of which those that matched points tie have become one, in the frame of the first of them.
+    """Return parts of which those that matched points tie have become one, in the frame of the first of them.
 
     parts: those placed by positions before others, the largest first. matches: verified ones (M, 2) by image numbers.
     """
@@ -101,7 +101,7 @@ def _tie(target: Part, part: Part, matches: Mapping[tuple[int, int], IntArray]) 
 
 
 def common_similarity(source: FloatArray, goal: FloatArray, tolerance: float) -> Similarity | None:
-    """The similarity from source (N, 3) to goal (N, 3) that most points agree with; None where too few do.
+    """Return the similarity from source (N, 3) to goal (N, 3) that most points agree with; None where too few do.
 
     tolerance: largest distance of an agreeing point, in the goal's unit.
     """

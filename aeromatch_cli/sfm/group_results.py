@@ -61,7 +61,7 @@ class Names:
 
 
 def adjusted_group(group: GroupResult, outcome: Outcome, given: Given, names: Names) -> GroupResult:
-    """A group with what its adjustment has found. given: what its images had."""
+    """Return a group with what its adjustment has found. given: what its images had."""
     network, state, found = outcome.result.network, outcome.result.state, outcome.result.found
     heights = None if found is None else _heights(network, state, found, metric=group.kind != "level")
     return group.model_copy(

@@ -8,7 +8,7 @@ from aeromatch_cli.data import IntArray
 
 
 def rows_by_number(numbers: IntArray) -> dict[int, IntArray]:
-    """Number -> the rows (N,) of an array (M,) that hold it, in order."""
+    """Return, by number, the rows (N,) of an array (M,) that hold it, in order."""
     order = np.argsort(numbers, kind="stable")
     values, starts = np.unique(numbers[order], return_index=True)
     return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=True)) if len(values) else {}

@@ -79,7 +79,7 @@ class Observed:
 
 
 def map_block(contents: ExportContents, observed: Observed, mapper: Mapper) -> tuple[Model, ...]:
-    """Models of a block's verified pairs, the largest first; given rotations are not used, but for their tilts.
+    """Return models of a block's verified pairs, the largest first; given rotations are not used, but for their tilts.
 
     Raises InputError where the mapper stops; no model is no error.
     """
@@ -102,7 +102,7 @@ class Group:
 def adjust_block(
     contents: ExportContents, observed: Observed, groups: Sequence[Group], *, fixed: bool
 ) -> tuple[AdjustedBlock, list[GroupResult]]:
-    """The block adjusted from its poses and verified pairs, and the result of every group.
+    """Return the block adjusted from its poses and verified pairs, and the result of every group.
 
     A given rotation is an observation in groups of kind "given", where the block still has it. groups: the largest
     first; those that matches tie become one, and images of none are tied to the first of which they share enough

@@ -358,7 +358,7 @@ def _write_errors(model: Any, network: Network, state: Unknowns, points: Sequenc
 
 
 def believed_tilts(pycolmap: ModuleType, model: Any, given: Given) -> FloatArray:
-    """The measured tilts, `Given.ups`, or NaN for all where the headings that were given with them are wrong.
+    """Return the measured tilts, `Given.ups`, or NaN for all where the headings that were given with them are wrong.
 
     A list whose headings contradict the positions has a fault that may be in its tilts as well. The model is placed by
     its positions and the terrain.
@@ -417,7 +417,7 @@ def drop_far_images(model: Any) -> None:
 
 
 def connected_parts(model: Any) -> list[list[int]]:
-    """Numbers of images that shared points connect with each other, the largest part first."""
+    """Return numbers of images that shared points connect with each other, the largest part first."""
     shared: Counter[tuple[int, int]] = Counter()
     for point in model.points3D.values():
         shared.update(combinations(sorted({int(element.image_id) for element in point.track.elements}), 2))

@@ -22,7 +22,7 @@ def centers_of(model: Any, ids: list[int]) -> FloatArray:
 
 
 def rotations_of(model: Any, ids: list[int]) -> FloatArray:
-    """(N, 3, 3) cam_from_world."""
+    """Return cam_from_world (N, 3, 3) of the images of a model."""
     return np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]).reshape(-1, 3, 3)
 
 

@@ -27,7 +27,7 @@ def grown(
     thresholds_px: Mapping[str, float],
     given: Mapping[str, Pose],
 ) -> tuple[Model, ...]:
-    """The models with further images, the largest first; smaller ones that became part of a larger one are gone.
+    """Return the models with further images, the largest first; smaller ones that became part of a larger one are gone.
 
     camera_ids: image_id -> camera_id. cameras: camera_id -> camera, where no model has found it. thresholds_px: by
     image_id, errors of exact matches in stored pixels. given: image_id -> pose whose position was given.

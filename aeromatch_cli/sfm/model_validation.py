@@ -43,7 +43,7 @@ def sound_part(
     thresholds_px: Mapping[str, float],
     given: Mapping[str, Pose],
 ) -> Model | None:
-    """The most images of a model that explained pairs hold in their places; None of fewer than three.
+    """Return the most images of a model that explained pairs hold in their places; None of fewer than three.
 
     A pair tells the direction from one image to another and not the distance. Points that three images see tell it:
     keypoints of an image that two of its pairs share. Images tied otherwise stay where their given positions confirm
@@ -72,7 +72,7 @@ def sound_part(
 
 
 def only(model: Model, image_ids: Collection[str]) -> Model:
-    """Some images of a model."""
+    """Return some images of a model."""
     left = sorted(image_ids)
     return replace(
         model,
@@ -110,7 +110,8 @@ def _confirmed(model: Model, given: Mapping[str, Pose]) -> set[str]:
 
 
 def rigid_groups(pairs: Sequence[PairPoints]) -> list[set[str]]:
-    """Images of pairs whose relative scales are known: two pairs of an image that share keypoints there, and so on."""
+    """Return images of pairs whose relative scales are known: two pairs of an image that share keypoints there, and so
+    on."""
     of_image: dict[str, list[tuple[tuple[str, str], set[int]]]] = {}
     for pair in pairs:
         ids = pair.image_id0, pair.image_id1

@@ -34,7 +34,7 @@ def tied_by_pairs(
     cameras: Mapping[str, Camera],
     thresholds_px: Mapping[str, float],
 ) -> dict[str, tuple[Pose, str]]:
-    """Poses of further images, and the image that each was tied to.
+    """Return poses of further images, and the image that each was tied to.
 
     known: oriented images, in the frame of the given positions. given: image_id -> pose whose position counts.
     thresholds_px: by image_id, errors of exact matches in stored pixels. The pair with most matches comes first; what

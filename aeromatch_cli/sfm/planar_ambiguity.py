@@ -56,7 +56,7 @@ def turned_back(
     sigmas_m: FloatArray,
     adjust: Adjust,
 ) -> Upright:
-    """The model with images turned back that are turned over, by their positions or by their errors.
+    """Return the model with images turned back that are turned over, by their positions or by their errors.
 
     positions_m (N, 3), sigmas_m (N,): one row per image number, NaN where there is none. adjust: adjusts and places a
     model.
@@ -181,7 +181,7 @@ def _apart_deg(pose: Any, other: Any) -> float:
 
 
 def other_pose(pose: FloatArray, points_m: FloatArray) -> FloatArray:
-    """(3, 4) cam_from_world of the other pose from which points (N, 3), about in a plane, look nearly the same.
+    """Return cam_from_world (3, 4) of the other pose from which points (N, 3), about in a plane, look nearly the same.
 
     Mirrored at the plane and in depth, about the middle of the points: what lies in the plane keeps its places across
     the line of sight, and nearer and farther are exchanged.

@@ -27,7 +27,7 @@ def consistent_images(
     cameras: Mapping[str, Camera],
     thresholds_px: Mapping[str, float],
 ) -> set[str]:
-    """Images whose poses agree with the relative poses of their matches, as inexact as they are.
+    """Return images whose poses agree with the relative poses of their matches, as inexact as they are.
 
     Images that no match judges are among them where most others are. cameras, thresholds_px (error of an exact match,
     stored pixels): by image_id. Grouped as `explained_images` are.

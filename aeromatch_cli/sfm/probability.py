@@ -54,7 +54,7 @@ class MatchEvidence:
 
 
 def usual_off_px(pairs: Iterable[MatchEvidence]) -> float:
-    """Median distance of all matches of a block from where they would be at their neighbours' heights."""
+    """Return the median distance of all matches of a block from where they would be at their neighbours' heights."""
     every = [pair.off_px for pair in pairs]
     return float(np.median(np.concatenate(every))) if every else 0.0
 
@@ -67,7 +67,8 @@ def off_neighbours_px(
     heights_m: FloatArray,
     focal1_px: float,
 ) -> FloatArray:
-    """(M,) distance in image 1 of each match from where it would be, were it as high as one of its neighbours.
+    """Return the distance (M,) in image 1 of each match from where it would be, were it as high as one of its
+    neighbours.
 
     Of the nearest matches in image 0 the one with the second smallest distance counts. rays0, rays1: (M, 3) unit
     vectors in the world from the centres (3,). heights_m: (M,) of the points where they meet.
@@ -88,8 +89,8 @@ def off_neighbours_px(
 
 
 def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
-    """(M, 6) what the model is linear in: one, score, confirmations by third images, those of the whole pair, distance
-    from the neighbours' heights, and how loose the pair is. usual_px: `usual_off_px` of the block.
+    """Return the columns (M, 6) in which the model is linear: one, score, confirmations by third images, those of the
+    whole pair, distance from the neighbours' heights, and how loose the pair is. usual_px: `usual_off_px` of the block.
 
     Confirmations of the pair are their mean: what no third image confirms is doubtful where third images confirm most
     others, not where none shows the ground. Means over the nearest 8 to 32 matches tell no more."""
@@ -111,17 +112,19 @@ def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
 
 
 def stated(values: FloatArray) -> FloatArray:
-    """(M,) probabilities of matches with such `columns` (M, 6)."""
+    """Return the probabilities (M,) of matches with such `columns` (M, 6)."""
     return _logistic(values @ np.array(WEIGHTS))
 
 
 def probabilities(evidence: MatchEvidence, usual_px: float) -> FloatArray:
-    """(M,) that the matches of a pair are right, to 3 pixels. usual_px: `usual_off_px` of the block."""
+    """Return the probabilities (M,) that the matches of a pair are right, to 3 pixels. usual_px: `usual_off_px` of the
+    block."""
     return stated(columns(evidence, usual_px))
 
 
 def fitted_weights(values: FloatArray, right: BoolArray) -> FloatArray:
-    """Weights of `columns` (M, 6) by maximum likelihood (Newton's method), given which matches (M,) are right."""
+    """Return the weights of `columns` (M, 6) by maximum likelihood (Newton's method), given which matches (M,) are
+    right."""
     weights = np.zeros(values.shape[1])
     for _ in range(50):
         p = _logistic(values @ weights)

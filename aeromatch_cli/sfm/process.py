@@ -19,7 +19,7 @@ ANY_DISTORTION = 1e9
 
 
 def run_process(module: str, folder: Path, result: str, what: str) -> Path:
-    """The file `result` that a module of this package makes in `folder`.
+    """Return the file `result` that a module of this package makes in `folder`.
 
     Raises MemoryError where it ends for lack of memory, InputError, naming `what`, where it stops otherwise: only the
     latter says something of the block.

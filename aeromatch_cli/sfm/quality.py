@@ -158,7 +158,7 @@ class QualityInput(Record):
 
 
 def judged(evidence: QualityInput) -> Quality:
-    """The verdict on a block, and what it rests on."""
+    """Return the verdict on a block, and what it rests on."""
     findings, unchecked = [*_connection(evidence)], list[str]()
     if evidence.adjust.images:
         for criterion in (
@@ -748,7 +748,8 @@ def _number(value: float) -> str:
 
 
 def plain(value: float, digits: int = 2) -> str:
-    """At least so many significant digits, without a power of ten where the number is large: 110, 2.9, 0.034."""
+    """Write a number with at least so many significant digits, without a power of ten where it is large: 110, 2.9,
+    0.034."""
     return f"{value:.0f}" if abs(value) >= 10.0 ** (digits - 1) else f"{value:.{digits}g}"
 
 

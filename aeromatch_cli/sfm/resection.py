@@ -24,7 +24,7 @@ def resected(
     thresholds_px: Mapping[str, float],
     sigmas: tuple[float, float],
 ) -> dict[str, Pose]:
-    """Poses of images that are not known, as many as points tie to the known ones or, through them, to others.
+    """Return poses of images that are not known, as many as points tie to the known ones or, through them, to others.
 
     cameras: by image_id. thresholds_px: by image_id, the largest error of an inlier in stored pixels. sigmas: of the
     poses found, metres and degrees. The image with most inliers comes first and is known from then on.

@@ -21,7 +21,7 @@ def residuals_of(
     images: Iterable[Image],
     keypoints_px: Callable[[str], FloatArray],
 ) -> dict[str, PoseResidual]:
-    """image_id -> residuals of every adjusted image, in the order of `images`.
+    """Return image_id -> residuals of every adjusted image, in the order of `images`.
 
     given: image_id -> pose as it was given, in the world of the adjusted block. keypoints_px: image_id -> (K, 2) stored
     pixels that the tracks point into.

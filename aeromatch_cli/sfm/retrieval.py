@@ -30,7 +30,7 @@ _RANKED_PER_CANDIDATE = 3
 
 
 def similar_pairs(features: Mapping[str, Path], candidates: int) -> list[tuple[str, str]]:
-    """Pairs (image_id0, image_id1) of images that look alike, `candidates` per image, sorted.
+    """Return pairs (image_id0, image_id1) of images that look alike, `candidates` per image, sorted.
 
     features: image_id -> file with byte descriptors; images without one have no pairs. Raises InputError where
     pycolmap stops.
@@ -47,7 +47,7 @@ def similar_pairs(features: Mapping[str, Path], candidates: int) -> list[tuple[s
 
 
 def best_pairs(ranking: IntArray, count: int) -> set[tuple[int, int]]:
-    """The first `count` pairs (a < b) of a ranking (N, R): all first choices, then all second ones, and so on.
+    """Return the first `count` pairs (a < b) of a ranking (N, R): all first choices, then all second ones, and so on.
 
     ranking: row by row the other images by falling similarity, -1 where there is none.
     """

@@ -17,7 +17,8 @@ from aeromatch_cli.geometry.cameras import normalise, project
 def at_once(
     adjusted: AdjustedBlock, cameras: Mapping[str, Camera], keypoints_px: Callable[[str], FloatArray]
 ) -> Callable[[str], FloatArray]:
-    """image_id -> (K, 2) keypoints as the image's pose alone sees them; the same where no read-out time was found.
+    """Return image_id -> (K, 2) keypoints as the image's pose alone sees them; the same where no read-out time was
+    found.
 
     cameras: image_id -> adjusted camera. A keypoint without a point of its own lies as far away as the nearest in the
     picture that has one.

@@ -101,7 +101,8 @@ def suffices(evidence: FirstPassMatches, good: set[str]) -> bool:
 
 
 def from_given(evidence: FirstPassMatches, good: set[str], *, correct: bool) -> Solution:
-    """Given poses as they are; with `correct`, those that the matches contradict by resection from the `good` ones.
+    """Return given poses as they are; with `correct`, those that the matches contradict by resection from the `good`
+    ones.
 
     Images without matches keep what was given: nothing speaks against it.
     """
@@ -151,7 +152,7 @@ def unoriented_remark(evidence: FirstPassMatches) -> str:
 
 
 def judged(given: Solution, pictures: Solution) -> Solution:
-    """Given poses as they are, with what the pictures say against them."""
+    """Return given poses as they are, with what the pictures say against them."""
     found = pictures.result
     better = pictures if found.frame == "world" and pictures.terrains else given
     against = {
@@ -185,7 +186,7 @@ def from_models(
     angles: Mapping[str, Angles],
     exchanged: str = "",
 ) -> Solution:
-    """Given poses and cameras, replaced by those of the mapper's models, the largest first.
+    """Return given poses and cameras, replaced by those of the mapper's models, the largest first.
 
     before: models are moved onto these poses, and where they agree the images keep them and their cameras. angles:
     image_id -> attitude as it was given. exchanged: columns with whose exchange the given positions fit the pictures.

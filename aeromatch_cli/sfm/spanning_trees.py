@@ -49,7 +49,7 @@ def trees_of(keypoints: int, ends: IntArray, scores: FloatArray) -> Trees:
 
 
 def shifts_through(trees: Trees, matrices: FloatArray, shifts: FloatArray) -> FloatArray:
-    """(K, 2) by how much each keypoint is moved so that it shows what the first one of its point shows.
+    """Return by how much (K, 2) each keypoint is moved so that it shows what the first one of its point shows.
 
     shifts: (K, 2) that bring each onto its parent where the detector put that one. matrices: (K, 2, 2) pixels of its
     image from pixels of its parent's.

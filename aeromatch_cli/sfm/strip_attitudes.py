@@ -18,7 +18,8 @@ _LEAST_SIGMA_DEG = 5.0
 
 
 def predicted(block: Block, found: Mapping[str, Pose]) -> dict[str, Pose]:
-    """Poses of images outside `found` that have a position, from the nearest images before and after in their strip.
+    """Return poses of images outside `found` that have a position, from the nearest images before and after in their
+    strip.
 
     A strip is the images of one camera in the order of capture time, or of name where times are missing. The attitude
     is that between both neighbours, its standard deviation the angle between them; no attitude where the flight turns

@@ -26,7 +26,7 @@ _WORTH = 0.6
 
 
 def thinned(model: Any) -> Any | None:
-    """A copy with the chosen points alone; None where these are most of them."""
+    """Return a copy with the chosen points alone; None where these are most of them."""
     chosen = chosen_points(model)
     if chosen.sum() > _WORTH * len(chosen):
         return None
@@ -38,7 +38,8 @@ def thinned(model: Any) -> Any | None:
 
 
 def chosen_points(model: Any) -> BoolArray:
-    """(P,) in the order of the points' numbers: of every cell of every image some that three images see, or more."""
+    """Choose (P,), in the order of the points' numbers, some points of every cell of every image that three images see,
+    or more."""
     tracks = tracks_of(model)
     images, keypoints, points = (tracks[f"track_{name}"] for name in ("images", "keypoints", "points"))
     seen = np.bincount(points, minlength=model.num_points3D())
@@ -65,7 +66,7 @@ def _spread(places_px: FloatArray, rank: FloatArray, width_px: int, height_px: i
 
 
 def take_poses(model: Any, thin: Any) -> None:
-    """Poses and cameras of the thinned copy for the model; its points stay where they were."""
+    """Take poses and cameras of the thinned copy for the model; its points stay where they were."""
     for number in thin.cameras:
         model.cameras[number].params = thin.cameras[number].params
     for number in image_numbers(thin):

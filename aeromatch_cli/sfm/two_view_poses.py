@@ -22,8 +22,8 @@ def placed_alone(
     keypoints_px: Callable[[str], FloatArray],
     pose0: Pose | None,
 ) -> AdjustedBlock | None:
-    """`block_of_pair` by what verified a pair; None where the block holds both images, or where that is no relative
-    orientation.
+    """Return `block_of_pair` by what verified a pair; None where the block holds both images, or where that is no
+    relative orientation.
 
     cameras: image_id -> camera of the verification. keypoints_px: (N, 2) of an image. pose0: as far as it is known.
     """

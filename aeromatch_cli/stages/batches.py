@@ -32,7 +32,7 @@ def matched_in_batches(
     pairs: Sequence[PairTask],
     sides: Callable[[PairTask], tuple[Features, Features]],
 ) -> dict[str, Matches]:
-    """Matches by image_id1, as are the matchers; none where a matcher takes pairs one by one.
+    """Match pairs in batches; return matches by image_id1, none where a matcher takes pairs one by one.
 
     A pair that fails here is left out: it is matched by itself, and fails again with its reason, or needs less memory.
     """

@@ -130,7 +130,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
 
 
 def with_gsd(block: Block, before_m: tuple[float | None, float | None], max_size_px: int) -> Block:
-    """The block with its common ground sampling distances: those that the workspace had, while they still fit.
+    """Return the block with its common ground sampling distances: those that the workspace had, while they still fit.
 
     before_m: of the images, and of reduced ones. max_size_px: longer side to which images are reduced, 0 for never.
     """
@@ -148,7 +148,7 @@ def _while_it_fits(gsd_m: float | None, before_m: float | None) -> float | None:
 
 
 def block_record(block: Block, given: Block, settings: Settings) -> dict[str, Any]:
-    """Contents of block.json. given: the block before it was oriented."""
+    """Return the contents of block.json. given: the block before it was oriented."""
     return {
         "format_version": FORMAT_VERSION,
         "crs": block.crs,

@@ -59,7 +59,7 @@ Key = tuple[str, str]
 
 
 def keypoints_of(step: Any, settings: Settings) -> int:
-    """Most that a step finds in an image."""
+    """Return the largest number of keypoints that a step finds in an image."""
     own = getattr(settings.extract, "keypoints", _SLOW_KEYPOINTS)
     return int((step.keypoints or min(_SLOW_KEYPOINTS, own)) if step.own_features else own)
 
@@ -146,7 +146,7 @@ def run(context: Context) -> list[StepContext]:
 
 
 def plan(context: Context) -> list[StepContext]:
-    """The steps as far as they are on file."""
+    """Return the steps as far as they are on file."""
     return list(_steps(context))
 
 
@@ -208,13 +208,13 @@ def makers(settings: Settings, workspace: Workspace) -> list[Workspace]:
 
 
 def further(context: Context) -> list[StepContext]:
-    """The steps after the first, each with all pairs."""
+    """Return the steps after the first, each with all pairs."""
     reasons = {(pair.image_id0, pair.image_id1): "" for pair in context.pairs}
     return [_further_step(context, recipe, reasons) for recipe in context.settings.cascade]
 
 
 def strategies_of(step: Step, settings: Settings) -> dict[str, Strategy]:
-    """Family -> strategy that a step takes instead of the settings' own."""
+    """Return, by family, the strategy that a step takes instead of the settings' own."""
     return _RECIPES[type(step)](step, settings)
 
 

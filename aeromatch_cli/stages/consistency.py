@@ -137,8 +137,8 @@ def _connection_left(context: Context, entries: Sequence[tuple[Pair, VerifiedEnt
 
 
 def final_block(context: Context) -> AdjustedBlock | None:
-    """The adjusted block with those points and observations that final matches hold; None as for `adjusted_block`.
-    Of a workspace whose stage consistency is up to date."""
+    """Return the adjusted block with those points and observations that final matches hold; None as for
+    `adjusted_block`. Of a workspace whose stage consistency is up to date."""
     adjusted = adjust.adjusted_block(context)
     path = context.workspace.final_or_adjusted
     return adjusted if adjusted is None or path == context.workspace.adjusted else read_adjusted(path)
@@ -194,8 +194,8 @@ def _shown_ninths(context: Context) -> dict[str, BoolArray]:
 
 
 def final_pairs(context: Context, features: Callable[[str], str] | None = None) -> Judged:
-    """Judged pairs in the order of pairs.csv, without the matches that contradict the adjusted block. features: as
-    `verified_pairs` has them."""
+    """Return judged pairs in the order of pairs.csv, without the matches that contradict the adjusted block. features:
+    as `verified_pairs` has them."""
     final = FinalEntries(context.workspace)
     for pair, entry in verified_pairs(context, features):
         yield pair, final.left(pair.image_id0, entry)  # of present keypoints: stale ones are none of those pairs

@@ -29,7 +29,8 @@ _Verified = Callable[[Context], Judged]
 
 
 def with_current_pairs(context: Context) -> tuple[Context, list[Pair]]:
-    """The context with the pairs whose results are up to date, and the other pairs. InputError where none is left."""
+    """Return the context with the pairs whose results are up to date, and the other pairs. InputError where none is
+    left."""
     outdated = outdated_pairs(context)
     if not outdated and context.pairs:
         return context, outdated

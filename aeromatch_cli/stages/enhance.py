@@ -51,7 +51,7 @@ class EnhanceTask:
 
 
 def make_task(context: Context, image: Image) -> EnhanceTask:
-    """The task of one image, with the fingerprint of everything that its result depends on."""
+    """Return the task of one image, with the fingerprint of everything that its result depends on."""
     settings = context.settings
     source = source_of(context, image)
     colour = settings.enhance.needs_colour or settings.extract.colours
@@ -67,7 +67,7 @@ def make_task(context: Context, image: Image) -> EnhanceTask:
 
 
 def source_of(context: Context, image: Image) -> Source:
-    """The picture of one image, with the fingerprint of everything that its pixels depend on."""
+    """Return the picture of one image, with the fingerprint of everything that its pixels depend on."""
     block = context.settings.block
     camera = context.block.camera(image)
     scale = scale_within(block.max_size_px, image.width_px, image.height_px)
@@ -111,7 +111,8 @@ def check_unchanged(source: Source) -> None:
 
 
 def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:
-    """Pixels as taken, their validity, and what the strategy made of them; always made anew: a PNG costs more."""
+    """Return pixels as taken, their validity, and what the strategy made of them; always made anew: a PNG costs
+    more."""
     pixels, valid = _read(task)
     return pixels, valid, task.enhancer(pixels, valid)
 

@@ -40,7 +40,7 @@ class ExtractTask:
 
 
 def make_task(context: Context, image: Image) -> ExtractTask:
-    """The task of one image, with the fingerprint of everything that its result depends on."""
+    """Return the task of one image, with the fingerprint of everything that its result depends on."""
     views = simulate.make_task(context, image)
     settings = context.settings
     geometry = context.geometry_fingerprint(image.image_id, settings.extract.needs)
@@ -75,7 +75,7 @@ def run_task(task: ExtractTask) -> Extracted:
 
 
 def in_stored_frame(features: Features, scale: float) -> Features:
-    """Keypoints of a reduced raster in the stored one, half-pixel correct."""
+    """Return keypoints of a reduced raster in the stored one, half-pixel correct."""
     if scale >= 1.0:
         return features
     keypoints = apply_homography(np.linalg.inv(resize_matrix(scale)), features.keypoints_px)
@@ -87,7 +87,7 @@ def in_stored_frame(features: Features, scale: float) -> Features:
 
 
 def task_of(context: Context, image_id: str) -> ExtractTask:
-    """The task of one image, made once per command."""
+    """Return the task of one image, made once per command."""
     if image_id not in context.known_tasks:
         context.known_tasks[image_id] = make_task(context, context.image_by_id[image_id])
     task: ExtractTask = context.known_tasks[image_id]

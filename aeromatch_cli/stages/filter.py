@@ -84,7 +84,8 @@ def _pair_fingerprint(context: Context, pair: Pair) -> str:
 
 
 def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
-    """One task per row of the shard, and the pairs whose matches or features are not up to date: those have none.
+    """Return one task per row of the shard, and the pairs whose matches or features are not up to date: those have
+    none.
 
     Larger rows first, so that none runs last.
     """
@@ -128,7 +129,7 @@ def _judge(task: FilterTask, pair: PairTask, entry: MatchEntry) -> VerifiedEntry
 
 
 def match_points(matches: Matches, keypoints0: FloatArray, keypoints1: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Stored-pixel points (M, 2) float64 of both sides: keypoints, or the measured place where there is none."""
+    """Return stored-pixel points (M, 2) float64 of both sides: keypoints, or the measured place where there is none."""
     sides = []
     for side, (keypoints, measured) in enumerate(((keypoints0, matches.points0_px), (keypoints1, matches.points1_px))):
         indices = matches.indices[:, side]
@@ -151,7 +152,7 @@ def candidates(matches: Matches, side0: Side, side1: Side) -> Candidates:
 
 
 def select(matches: Matches, keep: Any) -> Matches:
-    """The matches where `keep` (M,) is true."""
+    """Return the matches where `keep` (M,) is true."""
     return Matches(
         matches.indices[keep],
         matches.scores[keep],
@@ -199,7 +200,7 @@ def _result_on_file(context: Context, report: StageReport) -> FilterResult | Non
 
 
 def outdated_pairs(context: Context) -> list[Pair]:
-    """Pairs whose verdict, or the features that it points into, is not what present settings and inputs give."""
+    """Return pairs whose verdict, or the features that it points into, is not what present settings and inputs give."""
     features = extract.current(context, {i for p in context.pairs for i in (p.image_id0, p.image_id1)})
     outdated = []
     for image_id0, pairs in context.rows().items():
@@ -212,8 +213,8 @@ def outdated_pairs(context: Context) -> list[Pair]:
 
 
 def verified_pairs(context: Context, features: Callable[[str], str] | None = None) -> Judged:
-    """Judged pairs in the order of pairs.csv: stale rows, of older pair lists or features that were made again since,
-    cannot leak. features: fingerprint of an image's features, "" of none; by default from its file."""
+    """Return judged pairs in the order of pairs.csv: stale rows, of older pair lists or features that were made again
+    since, cannot leak. features: fingerprint of an image's features, "" of none; by default from its file."""
     row_id, row = "", dict[str, VerifiedEntry]()
     features = features or cache(partial(rows.features_on_file, context.workspace))
     for pair in context.pairs:

@@ -46,7 +46,7 @@ def is_large(block: Block) -> bool:
 
 
 def fitted(recipe: FirstPass, block: Block) -> FirstPass:
-    """The first pass as it is made of a block: large ones have ties to spare."""
+    """Return the first pass as it is made of a block: large ones have ties to spare."""
     if not is_large(block):
         return recipe
     sizes_px = {(image.width_px, image.height_px) for image in block.images}
@@ -60,7 +60,7 @@ def fitted(recipe: FirstPass, block: Block) -> FirstPass:
 
 
 def look(recipe: FirstPass, block: Block) -> FirstPass:
-    """The cheaper first pass by which given poses are judged before they are found anew."""
+    """Return the cheaper first pass by which given poses are judged before they are found anew."""
     longest_px = max(max(image.width_px, image.height_px) for image in block.images)
     size_px = max(_LOOK_LEAST_PX, min(_LOOK_SIZE_PX, round(_LOOK_SHARE * longest_px)))
     return recipe.model_copy(
@@ -73,14 +73,16 @@ def look(recipe: FirstPass, block: Block) -> FirstPass:
 
 
 def thorough(recipe: FirstPass, first: Context) -> FirstPass | None:
-    """The dearer first pass of a block in parts; None where it would take too long. first: the one that was run."""
+    """Return the dearer first pass of a block in parts; None where it would take too long. first: the one that was
+    run."""
     if max(len(first.pairs), count_pairs(first, recipe)) > _MOST_DEAR_PAIRS:
         return None
     return recipe.model_copy(update={"keypoints": _MORE_KEYPOINTS * recipe.keypoints})
 
 
 def prepared(context: Context, recipe: FirstPass, part: str = "first pass") -> Context:
-    """The context of the first pass of a block, without pairs; nothing is run yet. part: what is said to be done."""
+    """Return the context of the first pass of a block, without pairs; nothing is run yet. part: what is said to be
+    done."""
     settings = context.settings
     limit = settings.block.max_size_px
     size_px = min(recipe.size_px, limit) if limit else recipe.size_px
@@ -168,7 +170,7 @@ def count_pairs(context: Context, recipe: FirstPass) -> int:
 
 
 def verified_points(context: Context) -> Iterator[PairPoints]:
-    """Verified matches of the first pass, stored pixels."""
+    """Yield verified matches of the first pass, stored pixels."""
     keypoints = {}
     for pair, entry in filter.verified_pairs(context):
         if entry.verdict.state != "verified":

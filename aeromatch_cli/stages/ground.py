@@ -36,13 +36,15 @@ _ALTITUDE_SHARE = 0.25
 
 
 def ground_fingerprint(settings: Settings) -> str:
-    """The ground setting; of a DEM also its content, since it may be replaced in place."""
+    """Return the fingerprint of the ground setting; of a DEM also that of its content, since it may be replaced in
+    place."""
     text = settings.block.ground
     return f"{text} {image_fingerprint(Path(text))}" if Path(text).is_file() else text
 
 
 def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None, str, tuple[str, ...]]:
-    """The ground that settings or the camera file state, where it comes from in words, and remarks; else None."""
+    """Return the ground that settings or the camera file state, where it comes from in words, and remarks; else
+    None."""
     text = settings.block.ground
     if (z_m := stated_height_m(text)) is not None:
         if not abs(z_m) <= _FARTHEST_M:
@@ -60,7 +62,7 @@ def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None
 def judged_ground(
     context: Context, terrains: Sequence[Terrain], found: OrientResult
 ) -> tuple[Ground | None, str, list[str]]:
-    """The ground that later stages use, where it comes from in words, and what contradicts it.
+    """Return the ground that later stages use, where it comes from in words, and what contradicts it.
 
     terrains: of the pictures, one for each flight. found: by the orientation. A stated ground wins, unless it
     cannot be right.

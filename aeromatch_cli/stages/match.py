@@ -51,7 +51,7 @@ class RowResult:
 
 
 def matcher_of(context: Context, pair: Pair) -> Matcher:
-    """The matcher of a pair: guided for an image that the first pass could not tie to the others."""
+    """Return the matcher of a pair: guided for an image that the first pass could not tie to the others."""
     chosen: Matcher = context.settings.match
     untied = context.block.outside & {pair.image_id0, pair.image_id1}
     return chosen.model_copy(update={"guided": True}) if untied and isinstance(chosen, Search) else chosen
@@ -76,7 +76,7 @@ def _pair_fingerprint(context: Context, pair: Pair) -> str:
 
 
 def paired_images(context: Context) -> set[str]:
-    """Every image whose features the rows of this shard need."""
+    """Return every image whose features the rows of this shard need."""
     return {i for pairs in context.rows().values() for p in pairs for i in (p.image_id0, p.image_id1)}
 
 
@@ -86,7 +86,8 @@ def images_of_rows(context: Context) -> set[str]:
 
 
 def make_tasks(context: Context) -> list[MatchTask]:
-    """One task per row of the shard, pairs without features left out. Larger rows first, so that none runs last."""
+    """Return one task per row of the shard, pairs without features left out. Larger rows first, so that none runs
+    last."""
     features = extract.current(context, images_of_rows(context))
     tasks = []
     for image_id0, pairs in context.rows().items():
@@ -150,7 +151,7 @@ def compared(
     geometry: PairGeometry,
     sources: tuple[Source, Source] | None,
 ) -> Matches:
-    """Matches of one pair. sources: of both images, for a matcher that reads pixels."""
+    """Match one pair. sources: of both images, for a matcher that reads pixels."""
     if sources is None:
         return matcher(*features, geometry)
     return matcher(*features, geometry, (StoredRaster(sources[0]), StoredRaster(sources[1])))

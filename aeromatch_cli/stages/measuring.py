@@ -120,12 +120,12 @@ def _far_inside(shape: tuple[int, ...], valid: BoolArray | None, places: IntArra
 
 
 def in_working_frame(points_px: FloatArray, scale: float) -> FloatArray:
-    """Stored pixels (N, 2) in the raster that is worked on, half-pixel correct."""
+    """Return stored pixels (N, 2) in the raster that is worked on, half-pixel correct."""
     return points_px if scale >= 1.0 else apply_homography(resize_matrix(scale), points_px)
 
 
 def measure(task: MeasureTask) -> Measured:
-    """The keypoints of one image, in the order of the task; kept for later runs."""
+    """Measure the keypoints of one image, in the order of the task; the result is kept for later runs."""
     own: NDArray[np.uint8] = np.load(patches_of(task.folder, task.image_id), mmap_mode="r")
     parts = []
     for one in task.by:

@@ -26,21 +26,22 @@ _UNITS = {"MB": 1.0, "GB": 1e3, "MIB": 1.048576, "GIB": 1073.741824, "M": 1.0, "
 
 
 def worker_mb(megapixels: float, *, network: bool = False, stored: float = 0.0) -> float:
-    """Peak of one worker. megapixels: of the raster worked on, or of all its views, whichever are more. stored: of the
-    picture in its file, where that is reduced."""
+    """Estimate the peak memory of one worker, megabytes. megapixels: of the raster worked on, or of all its views,
+    whichever are more. stored: of the picture in its file, where that is reduced."""
     tile = min(_TILE_MB, _TILE_MB * megapixels / _TILE_MEGAPIXELS)
     pixels = max(_BYTES_PER_PIXEL * megapixels + tile, _DECODED_BYTES * stored)
     return _BASE_MB + pixels + (_NETWORK_MB if network else 0.0)
 
 
 def command_mb(jobs: int, megapixels: float, *, network: bool = False, stored: float = 0.0) -> float:
-    """Peak of a command with its workers, as for `worker_mb`; a single worker is the command's own process."""
+    """Estimate the peak memory of a command with its workers, megabytes, as for `worker_mb`; a single worker is the
+    command's own process."""
     each = worker_mb(megapixels, network=network, stored=stored)
     return _PARENT_MB + (jobs * each if jobs > 1 else each - _BASE_MB)
 
 
 def budget_mb(text: str) -> float | None:
-    """Megabytes of "8GB", "512MB", "8 GiB"; None for no budget. Raises ConfigError."""
+    """Read a number of megabytes from "8GB", "512MB", "8 GiB"; None for no budget. Raises ConfigError."""
     if not text.strip():
         return None
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]+)\s*", text)

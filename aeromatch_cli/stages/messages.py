@@ -226,7 +226,8 @@ def control_of(groups: Sequence[GroupResult]) -> list[ControlInGroup]:
 
 
 def control_words(control: Control | None, adjusted: Sequence[ControlInGroup] = ()) -> list[str]:
-    """Errors at surveyed points. adjusted: what control points did in the adjustment of every group."""
+    """Say in words how large the errors at surveyed points are. adjusted: what control points did in the adjustment of
+    every group."""
     if control is None:
         return []
     counts = f"control: {control.control} control points, {control.check} check points"

@@ -60,7 +60,8 @@ class Mapped:
 def best_mapped(
     context: Context, recipe: FirstPass, first: Context, evidence: FirstPassMatches
 ) -> tuple[Mapped, list[FurtherFirstPass]]:
-    """Models of a first pass, or of a further one where that has better ones, and what further ones were tried."""
+    """Return models of a first pass, or of a further one where that has better ones, and what further ones were
+    tried."""
     best = _mapped(context, recipe, first, evidence)
     tried: list[FurtherFirstPass] = []
     for words, further in (
@@ -193,8 +194,8 @@ def _largest(models: Sequence[Model]) -> int:
 def evidence_of(
     context: Context, recipe: FirstPass, *, by_position: bool = True, look: bool = False
 ) -> tuple[Context, FirstPassMatches]:
-    """The context of a first pass that has been run, and its verified matches. look: whether it is a look at given
-    poses, which another pass may follow."""
+    """Return the context of a first pass that has been run, and its verified matches. look: whether it is a look at
+    given poses, which another pass may follow."""
     prepared = first_pass.prepared(context, recipe, "first pass on given poses" if look else "first pass")
     first, failed = first_pass.run(prepared, recipe, by_position=by_position)
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
@@ -202,7 +203,7 @@ def evidence_of(
 
 
 def thresholds_px(first: Context) -> dict[str, float]:
-    """image_id -> error of an exact match of a first pass, stored pixels."""
+    """Return image_id -> error of an exact match of a first pass, stored pixels."""
     limit = first.settings.block.max_size_px
     sizes = {image.image_id: max(image.width_px, image.height_px) for image in first.block.images}
     return {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}

@@ -13,7 +13,7 @@ from aeromatch_cli.workspace import Workspace
 
 
 def names_on_file(workspace: Workspace) -> dict[str, str]:
-    """image_id -> name, as the workspace has them; none before it knows its images."""
+    """Return image_id -> name, as the workspace has them; none before it knows its images."""
     return {image.image_id: image.name for image in read_images(workspace.images)} if workspace.images.is_file() else {}
 
 
@@ -24,7 +24,7 @@ def item_named(item: str, names: Mapping[str, str]) -> str:
 
 
 def with_names(value: Any, names: Mapping[str, str]) -> Any:
-    """Results of stages, as JSON, with names in place of all image ids, as keys and as values."""
+    """Return results of stages, as JSON, with names in place of all image ids, as keys and as values."""
     if isinstance(value, Mapping):
         return {names.get(key, key): with_names(item, names) for key, item in value.items()}
     if isinstance(value, list | tuple):

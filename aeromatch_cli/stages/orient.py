@@ -51,7 +51,7 @@ _MAPPING = "mapping"
 def run(
     context: Context, altitudes: tuple[Ground, str] | None = None, *, dry: bool = False
 ) -> tuple[Context, StageReport]:
-    """The context with oriented cameras, poses and terrain.
+    """Orient the block; return the context with oriented cameras, poses and terrain.
 
     altitudes: the ground below relative altitudes and its source, which is judged. dry: only what is on file, nothing
     is made or written.
@@ -121,7 +121,7 @@ def _failed_images(context: Context, failed: Sequence[str]) -> list[tuple[str, s
 
 
 def groups(context: Context) -> list[Group]:
-    """Images that the orientation on file holds, the largest group first; none without an orientation."""
+    """Return images that the orientation on file holds, the largest group first; none without an orientation."""
     record = _on_file(replace(context, overwrite=False))
     return [Group(str(one["kind"]), tuple(one["images"])) for one in record.get("groups", ()) if one["images"]]
 

@@ -117,8 +117,9 @@ def _rounded(number: float) -> int:
 
 
 def columns(evidence: PairStatistics, keypoints: int) -> FloatArray | None:
-    """(5,) what the model is linear in: one, and of verified matches, keypoints in the overlap, view angle, and the
-    most keypoints that the step may find in the overlap. None where overlap or view angle are unknown."""
+    """Return the columns (5,) in which the model is linear: one, and of verified matches, keypoints in the overlap,
+    view angle, and the most keypoints that the step may find in the overlap. None where overlap or view angle are
+    unknown."""
     if not (evidence.overlap > 0.0 and np.isfinite(evidence.angle_deg)):
         return None
     most = min(keypoints, evidence.pixels / _PIXELS_PER_KEYPOINT)
@@ -134,12 +135,12 @@ def expected_number(known: FloatArray, weights: Sequence[float]) -> float:
 
 
 def fitted_weights(known: Sequence[FloatArray], found: Sequence[int]) -> FloatArray:
-    """(5,) weights by least squares of the logarithm, damped a little: where the step uses the first one's keypoints,
-    two columns say the same. known: `columns` of pairs; found: their verified matches after the step."""
+    """Return the weights (5,) by least squares of the logarithm, damped a little: where the step uses the first one's
+    keypoints, two columns say the same. known: `columns` of pairs; found: their verified matches after the step."""
     values, wanted = np.array(known), np.log(np.array(found) + _FEW)
     return np.asarray(np.linalg.solve(values.T @ values + _DAMPING * np.eye(values.shape[1]), values.T @ wanted))
 
 
 def log_error(expected: FloatArray, found: FloatArray) -> FloatArray:
-    """(N,) by how much expected numbers are larger than those found, natural logarithm."""
+    """Return by how much (N,) expected numbers are larger than those found, natural logarithm."""
     return np.asarray(np.log(expected + _FEW) - np.log(found + _FEW))

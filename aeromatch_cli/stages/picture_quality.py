@@ -19,8 +19,8 @@ _REMEDY = "look at them; --exclude leaves images out"
 
 
 def measured(context: Context, *, dry: bool = False) -> dict[str, PictureQuality]:
-    """image_id -> what is known of its picture: as images.csv has it of the same file, else measured now. Of a shard,
-    and dry, what is on file. A picture that cannot be read is absent: the stages that need it say so."""
+    """Return image_id -> what is known of its picture: as images.csv has it of the same file, else measured now. Of a
+    shard, and dry, what is on file. A picture that cannot be read is absent: the stages that need it say so."""
     try:
         before = read_picture_quality(context.workspace.images) if context.workspace.images.is_file() else {}
     except BrokenFileError:

@@ -14,7 +14,7 @@ _FEW_POINTS = 20
 
 
 def closing_lines(quality: Quality, results: BlockResults, names: Mapping[str, str]) -> list[str]:
-    """The verdict with what speaks against the block, and where it is weak. names: of the files, by image_id."""
+    """Say the verdict with what speaks against the block, and where it is weak. names: of the files, by image_id."""
     count = len(names)
     whole = f"all {count} images are connected" if count > 2 else "both images are connected"
     if results.adjust is not None and results.adjust.images:
@@ -25,7 +25,7 @@ def closing_lines(quality: Quality, results: BlockResults, names: Mapping[str, s
 
 
 def verdict_lines(quality: Quality, whole: str = "") -> list[str]:
-    """The verdict with what speaks against the block; whole: what is said where nothing does."""
+    """Say the verdict with what speaks against the block; whole: what is said where nothing does."""
     first, *others = [one.sentence for one in quality.faults] or [whole]
     return [f"{'result':<9} {quality.verdict}: {first}", *(f"{'':<9} {line}" for line in others)]
 

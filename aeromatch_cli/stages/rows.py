@@ -67,24 +67,24 @@ def redo(image_id0: str, pairs: Sequence[PairTask], old: Mapping[str, E], make: 
 
 
 def missing(pairs: Sequence[PairTask], old: Mapping[str, E]) -> list[PairTask]:
-    """The pairs without an entry that carries the wanted fingerprint."""
+    """Return the pairs without an entry that carries the wanted fingerprint."""
     on_file = {image_id1: entry.fingerprint for image_id1, entry in old.items()}
     return [pair for pair in pairs if on_file.get(pair.image_id1) != pair.fingerprint]
 
 
 def features_of(workspace: Workspace, image_id0: str, image_id1: str) -> tuple[str, str]:
-    """Fingerprints of the features on file: what an entry that is made now points into."""
+    """Return the fingerprints of the features on file: what an entry that is made now points into."""
     return features_on_file(workspace, image_id0), features_on_file(workspace, image_id1)
 
 
 def features_on_file(workspace: Workspace, image_id: str) -> str:
-    """Fingerprint of an image's features, "" of none."""
+    """Return the fingerprint of an image's features, "" of none."""
     return known_fingerprint(workspace.features(image_id)) or ""
 
 
 def stale_image(image_id0: str, entry: MatchEntry | VerifiedEntry, features: Callable[[str], str]) -> str:
-    """The image whose features were made again after the pair was matched, so that its matches' numbers mean other
-    keypoints; "" where there is none. features: `features_on_file` of a workspace."""
+    """Return the image whose features were made again after the pair was matched, so that its matches' numbers mean
+    other keypoints; "" where there is none. features: `features_on_file` of a workspace."""
     if entry.features == UNKNOWN:
         return ""
     for image_id, made_of in zip((image_id0, entry.image_id1), entry.features, strict=True):
@@ -111,7 +111,7 @@ def check_features(
 
 
 def readable(read: Callable[[Path], dict[str, E]], path: Path, overwrite: bool) -> dict[str, E]:
-    """The row on file as far as it is wanted and can be read: a broken file is made again."""
+    """Return the row on file as far as it is wanted and can be read: a broken file is made again."""
     if overwrite:
         return {}
     try:
@@ -121,7 +121,8 @@ def readable(read: Callable[[Path], dict[str, E]], path: Path, overwrite: bool) 
 
 
 def is_done(pairs: Sequence[PairTask], on_file: Mapping[str, str]) -> bool:
-    """Exactly the wanted pairs, each up to date: pairs that are no longer wanted leave the file."""
+    """Return whether exactly the wanted pairs are there, each up to date: pairs that are no longer wanted leave the
+    file."""
     return dict(on_file) == {pair.image_id1: pair.fingerprint for pair in pairs}
 
 

@@ -14,11 +14,11 @@ from aeromatch_cli import graph, report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.files import remove_stale_temporaries, translated_os_errors
+from aeromatch_cli.files import read_json, remove_stale_temporaries, translated_os_errors, whole_record
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
-from aeromatch_cli.results.stages import FilterResult
+from aeromatch_cli.results.stages import FilterResult, ReportResult
 from aeromatch_cli.stages import (
     adjust,
     cascade,

@@ -18,8 +18,8 @@ _NAMED = 4
 
 
 def changed_words(config: Path, settings: Settings) -> str:
-    """The settings that differ from those in `config`, the workspace's own, and from where on results that depend on
-    them are made again; "" where there are none, or no sound file."""
+    """Return the settings that differ from those in `config`, the workspace's own, and from where on results that
+    depend on them are made again; "" where there are none, or no sound file."""
     try:
         before = yaml.safe_load(dump(load(str(config))))
     except ConfigError:
@@ -43,7 +43,7 @@ def _resolved(value: Any) -> Any:
 
 
 def said_value(value: Any) -> str:
-    """A value as the command line writes it; steps and filters by their names."""
+    """Write a value as the command line does; steps and filters by their names."""
     if value is None:
         return "-"
     if isinstance(value, list):

@@ -49,7 +49,7 @@ class SimulateTask:
 
 
 def make_task(context: Context, image: Image) -> SimulateTask:
-    """The task of one image, with the fingerprint of everything that its result depends on."""
+    """Return the task of one image, with the fingerprint of everything that its result depends on."""
     enhancing = enhance.make_task(context, image)
     simulator = context.settings.simulate
     ground_z_m = context.ground_z_m(image.image_id)
@@ -63,7 +63,7 @@ def make_task(context: Context, image: Image) -> SimulateTask:
 
 
 def views_of(task: SimulateTask) -> tuple[View, ...]:
-    """The views of one image: geometry only."""
+    """Return the views of one image: geometry only."""
     camera = task.enhance.source.working_camera
     views = task.simulator(camera, task.pose, task.ground_z_m, task.gsd_m, task.neighbours)
     if task.as_taken and not any(view.is_source for view in views):
@@ -73,7 +73,7 @@ def views_of(task: SimulateTask) -> tuple[View, ...]:
 
 
 def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
-    """Gray pictures of every view of one image, and the enhancement they were made from.
+    """Return gray pictures of every view of one image, and the enhancement they were made from.
 
     With an enhancement `beside` the source that changed anything, all views of the source and then all of that.
     """
@@ -92,7 +92,8 @@ def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
 
 
 def further_views(pictures: Sequence[ViewPixels]) -> int:
-    """1 where the image as it was taken was added to simulated views because of other images' attitudes, else 0."""
+    """Return 1 where the image as it was taken was added to simulated views because of other images' attitudes, else
+    0."""
     return int(any(item.view.name == _ADDED for item in pictures))
 
 
@@ -163,7 +164,7 @@ def degenerate_view(workspace: Workspace, image: Image) -> str:
 
 
 def views_result(costs: Sequence[ViewCost]) -> ViewsResult:
-    """The views of images made now."""
+    """Return the views of images made now."""
     megapixels = round(math.fsum(cost.megapixels for cost in costs), 6)
     return ViewsResult(images=len(costs), views=sum(cost.views for cost in costs), view_megapixels=megapixels)
 

@@ -100,8 +100,8 @@ def _shard_failed_since(path: Path) -> bool:
 
 
 def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
-    """failures.csv anew from the reports of all stages; returns its rows (stage, item, reason), with ids as reports
-    have them, where the file has names.
+    """Write failures.csv anew from the reports of all stages; return its rows (stage, item, reason), with ids as
+    reports have them, where the file has names.
 
     What a later report of the same stage covers (the whole block, or a shard that owns the item) supersedes what an
     earlier one says of that item.
@@ -126,13 +126,13 @@ def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
 
 
 def once(rows: Collection[tuple[str, str, str]]) -> list[tuple[str, str, str]]:
-    """Rows (stage, item, reason) without those of a first pass that extraction names too."""
+    """Return rows (stage, item, reason) without those of a first pass that extraction names too."""
     extracted = {item for stage, item, _ in rows if stage == "extract"}
     return [row for row in rows if row[0] != "orient" or row[1] not in extracted]
 
 
 def owner(item: str) -> str:
-    """The image by which a failed item is sharded: itself, or the first of a pair "id0 id1"."""
+    """Return the image by which a failed item is sharded: itself, or the first of a pair "id0 id1"."""
     return item.partition(" ")[0]
 
 
@@ -152,7 +152,7 @@ def forget_absent(context: Context) -> None:
 
 
 def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[tuple[str, str]]:
-    """Failures (image_id0, reason), one per row, for pairs that lack what `command` makes.
+    """Return failures (image_id0, reason), one per row, for pairs that lack what `command` makes.
 
     Pairs that have failed there or before, themselves or by one of their images, are explained already.
     """

@@ -14,7 +14,7 @@ from aeromatch_cli.sfm.mapping import Model
 
 
 def exchanged_columns(block: Block, model: Model) -> str:
-    """The columns whose exchange makes the given positions fit a model that contradicts them, "" for none.
+    """Return the columns whose exchange makes the given positions fit a model that contradicts them, "" for none.
 
     Longitudes in the place of latitudes lie in another zone: they are not merely mirrored there.
     """

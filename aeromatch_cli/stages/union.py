@@ -66,9 +66,8 @@ class RowTask:
 
 
 def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
-    """The context of the stages after the cascade. What failed in a step is not among the parts, so that its joined
-    files are made again when it is there later.
-    """
+    """Return the context of the stages after the cascade. What failed in a step is not among the parts, so that its
+    joined files are made again when it is there later."""
     usable = _usable(steps)
     features: dict[str, str] = {}
     for image in context.block.images:
@@ -161,7 +160,8 @@ def join_keypoints(task: KeypointsTask) -> int:
 
 
 def joined_keypoints(parts: Sequence[tuple[str, FloatArray, FloatArray]]) -> JoinedKeypoints:
-    """parts: of each step name, places (K, 2) and sizes (K,)."""
+    """Join the keypoints that the steps of a cascade have found in one image. parts: of each step name, places (K, 2)
+    and sizes (K,)."""
     from scipy.spatial import cKDTree
 
     places, sizes = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
@@ -274,7 +274,8 @@ def joined_matches(
     keypoints0: JoinedKeypoints,
     keypoints1: JoinedKeypoints,
 ) -> Matches:
-    """Matches of one pair, numbered as in the joined keypoints. parts: step, its matches, what it has verified."""
+    """Return matches of one pair, numbered as in the joined keypoints. parts: step, its matches, what it has
+    verified."""
     indices, scores, views, costs = [], [], [], []
     for name, entry, verified in parts:
         found = entry.matches

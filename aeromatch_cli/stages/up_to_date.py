@@ -32,7 +32,7 @@ _KINDS_BESIDE, _NAMES_BESIDE = (".bin", ".xml", ".xyz"), ("block.json", "world.j
 
 
 def state_of_inputs(settings: Settings) -> dict[str, str]:
-    """Digests of what a run starts from; {} where that cannot be told, as images lie on another machine.
+    """Return digests of what a run starts from; {} where that cannot be told, as images lie on another machine.
 
     To be asked before anything is read: what is replaced while a run reads it is no longer what it was then.
     """

@@ -11,5 +11,5 @@ PIPELINE_VERSION = 3
 
 @cache
 def library_version(distribution: str) -> str:
-    """Version of an installed library whose arithmetic decides results; another one makes them stale."""
+    """Return the version of an installed library whose arithmetic decides results; another one makes them stale."""
     return metadata.version(distribution)

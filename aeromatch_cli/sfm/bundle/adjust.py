@@ -95,7 +95,7 @@ class Adjusted:
 
 
 def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
-    """The block that fits its observations best, from `start`, whose image points may be off by many pixels."""
+    """Return the block that fits its observations best, from `start`, whose image points may be off by many pixels."""
     stated = network
     network, start = _without_far_positions(network, start)
     network, state = _with_image_sigma(network, start, options, near=False)
@@ -341,8 +341,8 @@ def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -
 
 
 def position_residuals_m(network: Network, state: Unknowns) -> FloatArray:
-    """(N, 3) measured minus adjusted positions, of the antenna and with what was found of the flight; NaN where there
-    is none."""
+    """Return measured minus adjusted positions (N, 3), of the antenna and with what was found of the flight; NaN where
+    there is none."""
     lever = np.einsum("nji,nj->ni", state.rotations, state.mount[network.camera, 3:])
     off_m = off_by_flight_m(state.flight[network.flight], network.velocities_m_s, network.arms_m)
     expected = state.centers_m + lever + off_m

@@ -101,7 +101,7 @@ def covariance(network: Network, state: Unknowns) -> Covariance:
 
 
 def pose_sigmas(network: Network, state: Unknowns, found: Covariance) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (N, 3) of x, y, z in metres and (N, 3) of omega, phi, kappa in degrees.
+    """Return the standard deviations (N, 3) of x, y, z in metres and (N, 3) of omega, phi, kappa in degrees.
 
     NaN stands for unknown: an image without points, an angle that nothing determines.
     """
@@ -116,7 +116,7 @@ def pose_sigmas(network: Network, state: Unknowns, found: Covariance) -> tuple[F
 
 
 def lens_correlations(found: Covariance) -> list[tuple[int, str, str, float]]:
-    """Camera, two of its unknowns and their correlation, the strongest first."""
+    """Return the camera, two of its unknowns and their correlation, the strongest first."""
     listed: list[tuple[int, str, str, float]] = []
     for camera, matrix in enumerate(found.lens):
         free = np.flatnonzero(np.diag(matrix) > 0.0)

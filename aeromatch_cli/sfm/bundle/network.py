@@ -31,7 +31,8 @@ _UNCORRECTED_M = 0.5
 
 
 def drift_of(sigma_m: float, arms_m: FloatArray) -> float:
-    """Standard deviation of the slope of heights stated to sigma_m, metres per metre; 0 of a receiver with corrections.
+    """Return the standard deviation of the slope of heights stated to sigma_m, metres per metre; 0 of a receiver with
+    corrections.
 
     Errors at two ends of the block have nothing in common. arms_m: (N, 2) from the middle of the positions, in plan.
     """

@@ -115,7 +115,7 @@ class Reduced:
 
 
 def residuals_in_sigmas(network: Network, state: Unknowns) -> FloatArray:
-    """(M,) distances of image points from where they were measured, in standard deviations."""
+    """Return the distances (M,) of image points from where they were measured, in standard deviations."""
     return _apart(network, project(network, state))
 
 
@@ -128,7 +128,7 @@ def _apart(network: Network, xy_px: FloatArray) -> FloatArray:
 
 
 def cost(network: Network, state: Unknowns) -> float:
-    """Half the sum of squared residuals, those of image points through the loss."""
+    """Return half the sum of squared residuals, those of image points through the loss."""
     apart = residuals_in_sigmas(network, state)
     images = LOSS_SIGMAS**2 * np.log1p((apart / LOSS_SIGMAS) ** 2).sum()
     control = (state.points_m[network.control] - network.control_m) / network.control_sigmas_m
@@ -167,7 +167,8 @@ def equations(network: Network, state: Unknowns) -> Equations:
 
 
 def reduced(found: Equations, damping: float = 0.0) -> Reduced:
-    """damping: this share of the diagonal is added to it (Levenberg-Marquardt)."""
+    """Return the normal equations with the points eliminated. damping: this share of the diagonal is added to it
+    (Levenberg-Marquardt)."""
     from scipy import sparse
 
     matrix, right, coupling = found.undamped
@@ -249,7 +250,8 @@ def _positions(network: Network, state: Unknowns, layout: Layout | None = None) 
 
 
 def off_by_flight_m(flight: FloatArray, velocities_m_s: FloatArray, arms_m: FloatArray) -> FloatArray:
-    """(R, 3) by how much positions are off by what was found of their flights (R, 6). arms_m: (R, 2), `arms_m`."""
+    """Return by how much (R, 3) positions are off by what was found of their flights (R, 6). arms_m: (R, 2),
+    `arms_m`."""
     off_m = flight[:, :3] + velocities_m_s * flight[:, 3:4]
     off_m[:, 2] += (arms_m * flight[:, SLOPES]).sum(axis=1)
     return off_m

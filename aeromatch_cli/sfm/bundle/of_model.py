@@ -24,7 +24,8 @@ def image_numbers(model: Any) -> list[int]:
 
 
 def image_points(model: Any, images: list[int], points: list[int]) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """(M,) rows of the images, rows of the points, keypoints, and (M, 2) pixels from the centre of the first one."""
+    """Return, for M image points, rows of the images, rows of the points, keypoints, and (M, 2) pixels from the
+    centre of the first one."""
     row = {number: k for k, number in enumerate(images)}
     seen: list[tuple[int, int, int]] = []
     for k, number in enumerate(points):
@@ -46,7 +47,7 @@ def _grouped(values: IntArray, order: IntArray) -> tuple[list[int], list[IntArra
 
 
 def lens_of(camera: Any) -> FloatArray:
-    """(12,) values by LENS of a pycolmap camera."""
+    """Return the values (12,), by LENS, of a pycolmap camera."""
     values = dict.fromkeys(LENS, 0.0)
     named = dict(zip(camera.params_info.replace(" ", "").split(","), camera.params.tolist(), strict=True))
     f = named.pop("f", 0.0)
@@ -71,7 +72,7 @@ def set_lens(pycolmap: ModuleType, camera: Any, lens: FloatArray, fisheye: bool)
 def unknowns_of(
     model: Any, images: list[int], points: list[int], lens: FloatArray, mounts: int, flights: int
 ) -> Unknowns:
-    """lens: (K, 12)."""
+    """Return the unknowns of a pycolmap model. lens: (K, 12)."""
     poses = [model.images[i].cam_from_world() for i in images]
     rotations = np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3)
     shifts = np.array([pose.translation for pose in poses]).reshape(-1, 3)

@@ -35,8 +35,8 @@ class Projected:
 
 
 def local_points(network: Network, state: Unknowns) -> tuple[FloatArray, FloatArray]:
-    """(M, 3) observed points in the frames of their cameras, metres, and (M, 3) in the world how far a second of
-    read-out moves each one's centre."""
+    """Return the observed points (M, 3) in the frames of their cameras, metres, and (M, 3) in the world how far a
+    second of read-out moves each one's centre."""
     camera = network.camera[network.image]
     row = network.xy_px[:, 1] / np.maximum(network.rows_px[camera] - 1.0, 1.0) - 0.5
     path_m = network.velocities_m_s[network.image] * row[:, None]
@@ -46,7 +46,7 @@ def local_points(network: Network, state: Unknowns) -> tuple[FloatArray, FloatAr
 
 
 def project(network: Network, state: Unknowns) -> FloatArray:
-    """(M, 2) image points alone, NaN behind the camera."""
+    """Return the image points (M, 2) alone, NaN behind the camera."""
     local, _ = local_points(network, state)
     lens = state.lens[network.camera[network.image]]
     u, v = _normalised(local)

@@ -52,8 +52,8 @@ def lenses_by_flight(network: Network, state: Unknowns, tolerance: float) -> lis
 def lenses_if_freed(
     network: Network, state: Unknowns, sigmas: FloatArray, tolerance: float
 ) -> tuple[FloatArray, float]:
-    """(K, 12) changes of lenses with further unknowns, and by how much these lower the sum of squares, over what is
-    asked for. sigmas: (K, 12) of the further unknowns, else 0. state: a solution of the network."""
+    """Return the changes (K, 12) of lenses with further unknowns, and by how much these lower the sum of squares,
+    over what is asked for. sigmas: (K, 12) of the further unknowns, else 0. state: a solution of the network."""
     further = (sigmas > 0.0) & (network.lens_sigmas == 0.0)
     if not further.any():
         return np.zeros_like(sigmas), 0.0

@@ -32,7 +32,7 @@ class Solved:
 def solve(
     network: Network, state: Unknowns, tolerance: float, *, near: bool = False, still_sigmas: float = 0.0
 ) -> Solved:
-    """The unknowns nearest to all observations, from where `state` puts them.
+    """Return the unknowns nearest to all observations, from where `state` puts them.
 
     tolerance: it ends when a step lowers the cost by a smaller share. near: whether `state` is a solution but for some
     unknowns or weights. still_sigmas: it also ends when a step moves poses and calibration by less than so many of
