@@ -13,7 +13,7 @@ from benchmarks.verdicts.command import evidence_of, main, summary_of
 
 from aeromatch_cli.files import read_json
 from aeromatch_cli.geometry.cameras import focal_px
-from aeromatch_cli.sfm.quality import judged
+from aeromatch_cli.sfm.quality.judgement import judged
 
 
 @pytest.fixture(scope="module")

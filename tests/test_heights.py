@@ -28,7 +28,8 @@ from aeromatch_cli.results.adjustment import GroupResult
 from aeromatch_cli.results.stages import AdjustResult, OrientResult
 from aeromatch_cli.sfm.dem import Terrain
 from aeromatch_cli.sfm.heights import shift_of_points_m, shift_to_control_m
-from aeromatch_cli.sfm.quality import QualityInput, judged
+from aeromatch_cli.sfm.quality.finding import QualityInput
+from aeromatch_cli.sfm.quality.judgement import judged
 from aeromatch_cli.stages.ground import judged_ground
 from aeromatch_cli.stages.surveyed import height_remarks
 

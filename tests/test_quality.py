@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from make_results import filled
 
-from aeromatch_cli.sfm.quality import Finding, Quality, QualityInput, judged, plain
+from aeromatch_cli.sfm.quality.finding import Finding, Quality, QualityInput, plain
+from aeromatch_cli.sfm.quality.judgement import judged
 
 CALIBRATED = {"images": 12, "correlations": [], "parameters": {
     "f": [3010.0, 1.0, 3000.0, 30.0], "cx": [2005.0, 0.4, 1999.5, 80.0], "k1": [-0.01, 0.001, 0.0, 0.05],

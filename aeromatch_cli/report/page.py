@@ -52,7 +52,7 @@ from aeromatch_cli.report.rows import (
 from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.report.thumbnails import thumbnails
 from aeromatch_cli.results.stages import FilterResult, MatchResult, OrientResult, PairsResult, ReportResult
-from aeromatch_cli.sfm.quality import Finding, Quality, plain
+from aeromatch_cli.sfm.quality.finding import Finding, Quality, plain
 from aeromatch_cli.sfm.shutter import at_once
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, connection

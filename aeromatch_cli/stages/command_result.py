@@ -10,7 +10,7 @@ from typing import Any
 from aeromatch_cli import graph
 from aeromatch_cli.config import Settings
 from aeromatch_cli.results.stages import ExportResult, PairsResult
-from aeromatch_cli.sfm.quality import Level
+from aeromatch_cli.sfm.quality.finding import Level
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lost import Lost, lost_images, lost_lines, write_lost
 from aeromatch_cli.stages.messages import stage_lines

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from aeromatch_cli import graph
 from aeromatch_cli.results.stages import BlockResults, ConsistencyResult
-from aeromatch_cli.sfm.quality import Quality, QualityInput, judged
+from aeromatch_cli.sfm.quality.finding import Quality, QualityInput
+from aeromatch_cli.sfm.quality.judgement import judged
 from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.workspace import Workspace
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from aeromatch_cli.results.stages import BlockResults
-from aeromatch_cli.sfm.quality import Quality
+from aeromatch_cli.sfm.quality.finding import Quality
 from aeromatch_cli.stages.filter import WEAK_MATCHES
 
 _NAMED = 5

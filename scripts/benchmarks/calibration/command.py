@@ -35,8 +35,8 @@ import numpy as np
 from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.sfm.mapping import adjust_block
-from aeromatch_cli.sfm.quality import LEVELS
-from aeromatch_cli.sfm.quality import judged as verdict
+from aeromatch_cli.sfm.quality.finding import LEVELS
+from aeromatch_cli.sfm.quality.judgement import judged as verdict
 from aeromatch_cli.stages import adjust, orient
 from benchmarks import options, stamps
 from benchmarks.calibration.accuracy import Found, judged

@@ -14,7 +14,7 @@ from aeromatch_cli.sfm.block_figures import block_figures
 from aeromatch_cli.sfm.control import control_figures
 from aeromatch_cli.sfm.mapping import Observed
 from aeromatch_cli.sfm.outlier_rejection import Contradictions, Limits, MatchedKeypoints, contradicting
-from aeromatch_cli.sfm.quality import QualityInput
+from aeromatch_cli.sfm.quality.finding import QualityInput
 from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.strategies.exporters.contents import ExportContents

@@ -24,7 +24,8 @@ from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.sfm.mapping import adjust_block
-from aeromatch_cli.sfm.quality import QualityInput, judged
+from aeromatch_cli.sfm.quality.finding import QualityInput
+from aeromatch_cli.sfm.quality.judgement import judged
 from aeromatch_cli.stages import adjust
 from benchmarks import options
 from benchmarks.calibration.accuracy import Found

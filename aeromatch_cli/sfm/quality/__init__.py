@@ -1,0 +1,1 @@
+"""Whether an adjusted block can be trusted; `judgement.judged` gives the verdict."""
