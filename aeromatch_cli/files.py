@@ -1,7 +1,6 @@
 """Files of a workspace: how they are written and read, and how it is known that they are as they were written.
 
-Files appear under their final name complete or not at all. JSON ends with a checksum of itself. A record vouches for
-files by their digests.
+Files appear under their final name complete or not at all. JSON ends with a checksum of itself.
 """
 
 from __future__ import annotations
@@ -118,28 +117,15 @@ def json_object(text: str) -> dict[str, Any]:
     return value
 
 
-def write_record(path: Path, head: Mapping[str, Any], names: Iterable[str]) -> None:
-    """A JSON record with the digests of files below its folder, for which it vouches: it is written last."""
-    write_json(path, {**head, "files": {name: file_digest(path.parent / name) for name in sorted(names)}})
+def digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return the SHA-256 of files below a folder, by their names in it."""
+    return {name: file_digest(folder / name) for name in sorted(names)}
 
 
-def whole_record(path: Path, *, say: bool = False) -> dict[str, Any]:
-    """A record whose files are as they were written; else nothing. say: which is not."""
-    if not path.is_file():
-        return {}
-    record = read_json(path)
-    changed = changed_files(path.parent, record)
-    if changed and say:
-        log.warning(
-            "warning: %s was changed or removed since it was written, and counts as absent", path.parent / changed[0]
-        )
-    return {} if changed else record
-
-
-def changed_files(folder: Path, record: Mapping[str, Any]) -> list[str]:
-    """Those of a record's files that are no longer as they were written, or gone."""
-    paths = {name: folder / name for name in record["files"]}
-    return [n for n, path in paths.items() if not path.is_file() or file_digest(path) != record["files"][n]]
+def changed_files(folder: Path, known: Mapping[str, str], digest: Callable[[Path], str] = file_digest) -> list[str]:
+    """Return the names of files below a folder that are gone or no longer have the digests that are known of them.
+    digest: gives that of a file; by default it reads the file."""
+    return [name for name, one in known.items() if not (folder / name).is_file() or digest(folder / name) != one]
 
 
 def remove_stale_temporaries(root: Path) -> None:

@@ -43,8 +43,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "steps": ("steps/*", "steps.csv"),
     "refined": ("refined/*",),
     "adjusted": (
-        "orientation/adjusted.npz", "orientation/adjusted.json", "orientation/orientation.csv",
-        "orientation/residuals.csv",
+        "orientation/adjusted.npz", "orientation/orientation.csv", "orientation/residuals.csv",
     ),
     "final": ("orientation/dropped.npz", "orientation/final.npz"),
     "export": ("export/*",),

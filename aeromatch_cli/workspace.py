@@ -130,22 +130,12 @@ class Workspace:
         return self.root / "reports"
 
     @property
-    def exports(self) -> Path:
-        """Record of the files that the exporters wrote."""
-        return self.root / "export" / "files.json"
-
-    @property
     def evaluation(self) -> Path:
         return self.root / "evaluation"
 
     @property
     def report(self) -> Path:
         return self.root / "report" / "index.html"
-
-    @property
-    def report_files(self) -> Path:
-        """Record of the report's files."""
-        return self.root / "report" / "files.json"
 
     def enhanced(self, image_id: str, suffix: str) -> Path:
         return self._pictures / "enhanced" / f"{image_id}{suffix}"
@@ -182,17 +172,12 @@ class Workspace:
         """The measurements themselves, as they are before they are carried from image to image."""
         return self.root / "refined" / "measured" / f"{image_id}.npz"
 
-    @property
-    def refined_files(self) -> Path:
-        """Record of these files."""
-        return self.root / "refined" / "files.json"
-
     def export(self, exporter: str) -> Path:
         return self.root / "export" / exporter
 
     def exported(self) -> list[Path]:
         """Folders of all exports, also of earlier ones."""
-        return sorted(path for path in self.exports.parent.glob("[!.]*") if path.is_dir())
+        return sorted(path for path in (self.root / "export").glob("[!.]*") if path.is_dir())
 
     @property
     def export_is_older(self) -> bool:
@@ -203,10 +188,8 @@ class Workspace:
     def changed_tables(self) -> list[str]:
         """Names of the tables of the block that are not as they were written, or gone. Raises as `check_version`."""
         self.check_version()
-        if not self.block.is_file():
-            return []
-        record = read_json(self.block)
-        return changed_files(self.root, record) if "files" in record else []  # none of earlier versions
+        path = self.stage_report("pairs")
+        return changed_files(self.root, read_json(path).get("files", {})) if path.is_file() else []
 
     def check_tables(self) -> None:
         """Raises WorkspaceError where a table of the block is not as it was written."""

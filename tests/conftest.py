@@ -261,7 +261,7 @@ def _copied(rendered: Path, folder: Path, settings: tuple[str, ...] = ()) -> Sit
 # --- comparing workspaces -----------------------------------------------------------------------------------------
 
 # The page tells the time at which it was made, finished.json those of all files.
-_NOT_COMPARED = ("report/index.html", "report/files.json", "reports/report.json", "finished.json")
+_NOT_COMPARED = ("report/index.html", "reports/report.json", "finished.json")
 
 
 def contents(work: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from aeromatch_cli.blocks.plausibility import warnings_of
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Image, Pose
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.files import write_record
+from aeromatch_cli.files import write_json
 from aeromatch_cli.geometry.cameras import from_colmap
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.stages import simulate
@@ -106,5 +106,5 @@ def test_small_views_are_a_reason_of_their_own(
     workspace, image = Workspace(tmp_path), Image("a", "a.jpg", 800, 600, "c")
     assert simulate.degenerate_view(workspace, image) == ""
     record = {"fingerprint": "", "scale": scale, "remark": remark, "views": [view(*size) for size in views]}
-    write_record(workspace.views("a"), record, ())
+    write_json(workspace.views("a"), record)
     assert simulate.degenerate_view(workspace, image) == said

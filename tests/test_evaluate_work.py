@@ -20,7 +20,7 @@ from aeromatch_cli.evaluate.mapping import map_database
 from aeromatch_cli.evaluate.output import condition_rows, facts, lines, summary_rows, write_evaluation
 from aeromatch_cli.evaluate.totals import total
 from aeromatch_cli.evaluate.work import Evaluation
-from aeromatch_cli.files import read_json, write_record
+from aeromatch_cli.files import digests, read_json, write_json
 from aeromatch_cli.formats.features import features_fingerprint, read_features, write_features
 from aeromatch_cli.formats.rows import read_verified_row, write_verified_row
 from aeromatch_cli.lab.opening import open_truth
@@ -181,11 +181,12 @@ def test_what_does_not_belong_together_is_refused(work: Path, rendered: Path, tm
 
 
 def _with_images(work: Path, old: str, new: str) -> Path:
-    """The workspace as a run over other images would have left it: the block's record vouches for its table."""
+    """The workspace as a run over other images would have left it: the report of pairs vouches for its table."""
     table = work / "images.csv"
     table.write_text(table.read_text().replace(old, new))
-    record = read_json(work / "block.json")
-    write_record(work / "block.json", record, record["files"])
+    report = work / "reports" / "pairs.json"
+    record = read_json(report)
+    write_json(report, {**record, "files": digests(work, record["files"])})
     return work
 
 

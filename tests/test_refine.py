@@ -180,12 +180,12 @@ def test_tie_points_are_nearer_to_their_exact_places(done_site: Site, rendered: 
 @pytest.mark.slow
 def test_without_refinement_tie_points_stay_where_the_detector_put_them(done_site: Site) -> None:
     work = Workspace(done_site.work)
-    assert work.refined_files.is_file()
-    assert not list(work.refined_files.parent.glob("*.npy"))
+    assert work.stage_report("refine").is_file()
+    assert not list(work.refined("").parent.glob("*.npy"))
     outcome = done_site("run", "--set", "refine=none")
     assert outcome.code == 0, outcome.stderr
     assert outcome.facts["stages"]["refine"]["result"]["measured"] is None
-    assert not work.refined_files.parent.exists()
+    assert not work.refined("").parent.exists()
     for image in read_images(work.images):
         np.testing.assert_array_equal(final(work)(image.image_id), read_keypoints(work.features(image.image_id))[0])
 

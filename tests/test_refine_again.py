@@ -22,7 +22,7 @@ from aeromatch_cli.workspace import Workspace
 @pytest.mark.slow
 def test_what_lacked_a_picture_is_made_again_when_it_is_back(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     work = Workspace(done_site.work)
-    kept = [work.adjusted, work.dropped, *sorted(work.refined_files.parent.glob("*.npz"))]
+    kept = [work.adjusted, work.dropped, *sorted(work.refined("").parent.glob("*.npz"))]
     before = {path: path.read_bytes() for path in kept if path.is_file()}
     name = done_site.names()[1]
 
@@ -36,7 +36,7 @@ def test_what_lacked_a_picture_is_made_again_when_it_is_back(done_site: Site, mo
         patch.setattr(measuring, "read_source", unreadable)
         outcome = done_site("adjust", "--overwrite", "--executor", "serial")
         assert outcome.code == 1
-        made = {path: path.stat().st_mtime_ns for path in (work.adjusted, work.refined_files)}
+        made = {path: path.stat().st_mtime_ns for path in (work.adjusted, work.stage_report("refine"))}
         again = done_site("adjust", "--executor", "serial")
         # What can be made without it is not made again.
         assert again.code == 1
@@ -66,7 +66,7 @@ def test_a_picture_that_is_another_for_a_while_is_not_measured(
         finally:
             aside.replace(image)
 
-    shutil.rmtree(work.refined_files.parent)
+    shutil.rmtree(work.refined("").parent)
     with monkeypatch.context() as patch:
         patch.setitem(FUNCTIONS, "refine", swapped)
         outcome = done_site("adjust")
@@ -86,7 +86,7 @@ def test_images_measured_in_parts_are_measured_alike(done_site: Site, monkeypatc
 
 
 def _files(work: Workspace) -> dict[str, bytes]:
-    folder = work.refined_files.parent
+    folder = work.refined("").parent
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
@@ -97,7 +97,7 @@ def test_a_stage_that_was_stopped_goes_on_and_ends_alike(done_site: Site, monkey
     before = _files(work)
     names = sorted(path.stem for path in work.measured("").parent.glob("*.npz"))
     assert len(names) >= IMAGES - 1  # nothing measures an image all of whose keypoints stand for their points
-    work.refined_files.unlink()
+    work.stage_report("refine").unlink()
     for name in names[2:]:
         work.measured(name).unlink()
     measured: list[str] = []
@@ -113,7 +113,7 @@ def test_a_stage_that_was_stopped_goes_on_and_ends_alike(done_site: Site, monkey
     # A file that does not hold what it should is no reason to stop, nor to believe it.
     damaged = work.measured(names[0])
     damaged.write_bytes(damaged.read_bytes()[:-30])
-    work.refined_files.unlink()
+    work.stage_report("refine").unlink()
     measured.clear()
     assert done_site("adjust", "--executor", "serial").code == 0
     assert measured == names[:1]

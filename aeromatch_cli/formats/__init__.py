@@ -7,8 +7,8 @@ without Python objects; their zip comment is `CRC-32 ` and the checksum (8 hex d
 - Pixels are (x, y); (0, 0) is the centre of the top-left pixel of the stored raster, whatever its EXIF Orientation.
 - Metres are in the world frame: the CRS of `block.json` minus its `origin_m`. x is east, y north, z up.
 - Poses are `cam_from_world`: the camera has x right, y down, z forward.
-- JSON files end with `checksum`: CRC-32 (hex) of the text before it. `files` of a record: SHA-256 of files beside it;
-  of an SQLite database without journal mode and counters, which change when it is read.
+- JSON files end with `checksum`: CRC-32 (hex) of the text before it. `files`: SHA-256 of files; of an SQLite database
+  without journal mode and counters, which change when it is read.
 - Files appear under their name complete or not at all. A fingerprint is a SHA-256 of all settings and inputs that a
   result depends on; a result is up to date where it is present with an equal fingerprint.
 
@@ -28,7 +28,6 @@ The resolved configuration, every default included. `aeromatch run WORK/config.y
 - `ground_source`: where the ground height comes from, in words. `ground_z_m`: world height, null with a DEM or none.
 - `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
 - `ground_fingerprint`: of the setting that the ground comes from.
-- `files`: SHA-256 of the tables below, as they were written.
 
 ### finished.json
 
@@ -66,14 +65,13 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
 
 ### orientation/orientation.json
 
-- `fingerprint`: of the inputs and settings. `images`: fingerprint of what was given of every image. `settings`: of the
-  rest. `files`: SHA-256 of the other files.
+- `images`: fingerprint of what was given of every image. `settings`: fingerprint of the rest.
 - `result`: see [Result of orient](#result-of-orient).
 - `failed`: images and rows of pairs that the first pass had to leave out; once they can be read again, `orient` starts
   anew.
 - `tied`: pairs that the first pass verified. `similar`: pairs that look alike, where they were asked for.
 - `groups`: images that were oriented together, the largest group first: `kind` (`given`, `positions`, or `level`: no
-  positions, scale and origin arbitrary), `images`.
+  positions, scale and origin arbitrary), `images`. `terrains`: names of the files of terrain.
 
 ### orientation/cameras.csv, poses.csv
 
@@ -89,8 +87,7 @@ apart have one each: `terrain-2.tif` and so on.
 Written by `adjust`: the bundle adjustment of the verified matches. One line per image of known place, in the block's
 CRS: `image` (its name); `x`, `y`, `z` of the projection centre, metres; `omega_deg`, `phi_deg`, `kappa_deg`
 (photogrammetric, against the grid of the CRS); `sigma_x_m` to `sigma_kappa_deg`: standard deviations, empty where they
-are not known, too small in blocks of more than 1,500 images, where each is taken with the others as known; `camera`:
-camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north and scale are arbitrary;
+are not known; `camera`: camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north and scale are arbitrary;
 standard deviations hold within the group, those of positions are empty), or `predicted` of an image that is not
 oriented: the position given, the attitude given or that of its strip, empty where nothing is known; `unit`: of all
 lengths of the line, `m`, or `arbitrary` in a frame of its own.
@@ -103,11 +100,6 @@ adjusted image: `image` (its name); `dx_m`, `dy_m`, `dz_m`: adjusted less given 
 adjusted one; `dx_sigmas` to `dz_sigmas` and `rotation_x_sigmas` to `rotation_z_sigmas`: the same in the standard
 deviations that were stated, each axis in its own. All are empty where nothing was given, and in a frame of its own.
 `error_px`: mean reprojection error; `points`: of the image; `images_per_point`: how many images see them, mean.
-
-### orientation/adjusted.json
-
-- `fingerprint`; `files`: SHA-256 of `adjusted.npz`, `orientation.csv` and `residuals.csv`.
-- `result`: see [Result of adjust](#result-of-adjust).
 
 ### orientation/adjusted.npz
 
@@ -133,7 +125,7 @@ judged, exported, drawn and evaluated has these places; features, matches and tw
 detector, by which the errors that colours show were found.
 
 - `keypoints_px` (K, 2) float32: of all keypoints of features/<id>.npz; `measured` (K,) bool: those that stand for their
-  points, or were brought onto one that does. `fingerprint`: that of the features. `files.json` is the record of all.
+  points, or were brought onto one that does. `fingerprint`: that of the features.
 
 ### refined/measured/<id>.npz
 
@@ -239,6 +231,9 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 
 - `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`.
 - `failures`: [[item, reason], ...].
+- `files`: of a stage of the whole block, SHA-256 of the files that it has written, by their names in the workspace. The
+  stage is up to date where its `fingerprint` is that of the present settings and inputs and these files are as they
+  were written.
 - `result`: what the stage has found, null for nothing; see [Results of stages](#results-of-stages). Images are named
   by their ids, in what `--json` prints by their names.
 
@@ -272,11 +267,6 @@ Written by `aeromatch evaluate`: `evaluation.json` (`format_version`, `workspace
 `left_out`, `min_overlap`, `totals`, `conditions`, `summary`, `consumer`, `seconds`; null where unknown), `pairs.csv`
 (one
 line per pair), `conditions.csv`, plots as PNG.
-
-### export/files.json, report/files.json
-
-`files`: of all that the exporters, or the report, have written. `told`, of the report: the files of the workspace that
-the page tells of. Both hold SHA-256 digests; what differs is made again.
 
 ### export/colmap/
 

@@ -3,6 +3,6 @@
 rows -> figures -> map, previews -> page (page.html.jinja)
 """
 
-from aeromatch_cli.report.page import run, told_digests
+from aeromatch_cli.report.page import is_of_earlier_results, kept, run
 
-__all__ = ["run", "told_digests"]
+__all__ = ["is_of_earlier_results", "kept", "run"]

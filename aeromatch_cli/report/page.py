@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
 from aeromatch_cli.data import AdjustedBlock, FloatArray
-from aeromatch_cli.files import write_record, write_text
+from aeromatch_cli.files import write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
@@ -70,29 +70,42 @@ _STATE_RANK = {"rejected": 0, "not verifiable": 1, NOT_JUDGED: 2}
 
 def run(context: Context) -> StageReport:
     """Write report/index.html. Raises WorkspaceError when a file of the workspace is broken."""
-    report, told = StageReport("report", items=1), told_digests(context.workspace)
+    report = StageReport("report", items=1, fingerprint=_told_fingerprint(context.workspace))
+    results = _told_fingerprint(context.workspace, settings=False)
     adjustment = read_adjustment(context)
     found = gather(context, pair_table, spread=adjustment.judged.spread)
-    pairs, images = found.pairs, found.images
     with settled():
         page = render(context, found, adjustment)
     write_text(context.workspace.report, page)
-    record = context.workspace.report_files
-    folder = record.parent
-    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file() and path != record)
-    write_record(record, {"told": told}, names)
+    report.vouches_for(context.workspace, (p for p in context.workspace.report.parent.rglob("*") if p.is_file()))
     report.done = 1
-    report.fingerprint = fingerprint([vars(row) for row in pairs], [vars(row) for row in images])
-    report.result = ReportResult(page="report/index.html", bytes=len(page.encode("utf-8")))
+    report.result = ReportResult(page="report/index.html", bytes=len(page.encode("utf-8")), of_results=results)
     return report.write(context.workspace)
 
 
-def told_digests(workspace: Workspace) -> dict[str, str]:
-    """Digests of the files that a page tells of, by their names in the workspace. Times of files would not do to see
-    that they are as they were: clocks are set back, and a folder's server has its own."""
+def kept(context: Context) -> StageReport | None:
+    """Return the report of the page on file, where everything that it tells of is as it was when it was written."""
+    report = StageReport("report", items=1, fingerprint=_told_fingerprint(context.workspace))
+    return report if report.is_up_to_date(context) else None
+
+
+def is_of_earlier_results(workspace: Workspace) -> bool:
+    """Whether the page on file tells of results that are no longer there. Settings do not count: a run without the page
+    has others than one with it."""
+    page = result_on_file(workspace, ReportResult)
+    return workspace.report.is_file() and (
+        page is None or page.of_results != _told_fingerprint(workspace, settings=False)
+    )
+
+
+def _told_fingerprint(workspace: Workspace, *, settings: bool = True) -> str:
+    """Return the fingerprint of the files that a page tells of. Times of files would not do to see that they are as
+    they were: clocks are set back, and a folder's server has its own. settings: whether the list of settings is one of
+    them."""
     told = [path for path in workspace.reports.glob("*.json") if path != workspace.stage_report("report")]
-    told += [workspace.block, workspace.images, workspace.poses, workspace.pairs, workspace.failures, workspace.config]
-    return {p.relative_to(workspace.root).as_posix(): file_digest(p) for p in sorted(told) if p.is_file()}
+    told += [workspace.block, workspace.images, workspace.poses, workspace.pairs, workspace.failures]
+    told += [workspace.config] if settings else []
+    return fingerprint([(path.name, file_digest(path)) for path in sorted(told) if path.is_file()])
 
 
 def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:

@@ -107,7 +107,6 @@ class PairsResult(StageResult):
     warnings: list[str] = Field(description="What a person should look at.")
     urgent: list[str] = Field([], description="Those of the warnings that --quiet does not hide.")
     unread: dict[str, str] = Field({}, description="Picture of a kind that is not read -> reason.")
-    pairs_sha256: str = Field(description="SHA-256 of pairs.csv.")
 
 
 class EnhanceResult(StageResult):
@@ -297,6 +296,7 @@ class ReportResult(StageResult):
 
     page: str
     bytes: int
+    of_results: str = Field("", description="Fingerprint of all that the page tells of but the settings.")
 
 
 class BlockResults(Record):

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, PoseResidual
 from aeromatch_cli.errors import InputError
-from aeromatch_cli.files import translated_os_errors, whole_record, write_atomically, write_record, write_text
+from aeromatch_cli.files import write_atomically, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.formats.residuals import residuals_text
@@ -29,7 +29,7 @@ from aeromatch_cli.stages import orient, refine
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint
-from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.stage_report import StageReport, forget
 from aeromatch_cli.stages.surveyed import control_of_block, control_remarks, counted_from_below, height_remarks
 from aeromatch_cli.stages.unregistered import unregistered_reasons
 from aeromatch_cli.stages.versions import library_version
@@ -51,9 +51,7 @@ def run(context: Context) -> StageReport:
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
     report.fingerprint = _fingerprint(context, groups)
-    record = _on_file(context)
-    if record.get("fingerprint") == report.fingerprint:
-        report.skipped, report.result = report.items, AdjustResult(**record["result"])
+    if report.is_up_to_date(context):
         return report.write(context.workspace)
     _remove(context)
     try:
@@ -67,8 +65,7 @@ def run(context: Context) -> StageReport:
     residuals = _residuals(context, adjusted)
     report.result = _result(context, adjusted, found, residuals)
     report.done = report.items
-    head = {"fingerprint": report.fingerprint, "result": report.result.as_json()}
-    _write(context, adjusted, residuals, head)
+    report.vouches_for(context.workspace, _write(context, adjusted, residuals))
     return report.write(context.workspace)
 
 
@@ -96,7 +93,9 @@ def _groups(context: Context) -> Sequence[Group]:
 
 def _is_current(context: Context, groups: Sequence[Group]) -> bool:
     made_now = replace(context, overwrite=False)
-    return bool(groups) and _on_file(made_now).get("fingerprint") == _fingerprint(context, groups)
+    if not groups:
+        return False
+    return StageReport("adjust", fingerprint=_fingerprint(context, groups)).is_up_to_date(made_now)
 
 
 def current_fingerprint(context: Context) -> str:
@@ -123,16 +122,10 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     return fingerprint(versions, *how, held, state, known, pairs, control, refine.made_fingerprint(context))
 
 
-def _on_file(context: Context) -> Mapping[str, Any]:
-    """The record of an earlier run whose files are as they were written, else nothing."""
-    return {} if context.overwrite else whole_record(context.workspace.orientation / "adjusted.json", say=True)
-
-
 def _remove(context: Context) -> None:
     folder = context.workspace.orientation
-    for name in ("adjusted.json", "adjusted.npz", "orientation.csv", "residuals.csv", context.workspace.final.name):
-        with translated_os_errors(folder / name):
-            (folder / name).unlink(missing_ok=True)
+    names = ("adjusted.npz", "orientation.csv", "residuals.csv", context.workspace.final.name)
+    forget(context, "adjust", [folder / name for name in names])
 
 
 def _residuals(context: Context, adjusted: AdjustedBlock) -> dict[str, PoseResidual]:
@@ -140,15 +133,14 @@ def _residuals(context: Context, adjusted: AdjustedBlock) -> dict[str, PoseResid
     return residuals_of(adjusted, context.observed.poses, context.block.images, keypoints_px)
 
 
-def _write(
-    context: Context, adjusted: AdjustedBlock, residuals: Mapping[str, PoseResidual], head: Mapping[str, Any]
-) -> None:
-    """The record, which begins with `head`, comes last: it vouches for the others."""
-    folder = context.workspace.orientation
-    write_atomically(context.workspace.adjusted, lambda stream: write_adjusted(stream, adjusted))
-    write_text(folder / "orientation.csv", orientation_text(adjusted, context.block))
-    write_text(context.workspace.residuals, residuals_text(residuals, context.block.images))
-    write_record(folder / "adjusted.json", head, ("adjusted.npz", "orientation.csv", "residuals.csv"))
+def _write(context: Context, adjusted: AdjustedBlock, residuals: Mapping[str, PoseResidual]) -> list[Path]:
+    """Write what was found; return the files."""
+    workspace = context.workspace
+    table = workspace.orientation / "orientation.csv"
+    write_atomically(workspace.adjusted, lambda stream: write_adjusted(stream, adjusted))
+    write_text(table, orientation_text(adjusted, context.block))
+    write_text(workspace.residuals, residuals_text(residuals, context.block.images))
+    return [workspace.adjusted, table, workspace.residuals]
 
 
 def _result(

@@ -12,10 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair, Verdict
-from aeromatch_cli.files import read_json, translated_os_errors, write_atomically
+from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
-from aeromatch_cli.formats.archives import load_checked
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
@@ -28,7 +27,7 @@ from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, connection, select, verified_pairs
 from aeromatch_cli.stages.rows import check_features
-from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.stage_report import StageReport, forget
 from aeromatch_cli.workspace import Workspace
 
 VERSION = 7
@@ -49,24 +48,14 @@ def run(context: Context) -> StageReport:
     if adjusted is None or recipe is None:
         words = f"not done: match {context.settings.match.name} measures points without keypoints"
         report.result = ConsistencyResult(remark=words if context.settings.match.reads_pixels else "")
-        for stale in (path, context.workspace.final):
-            with translated_os_errors(stale):
-                stale.unlink(missing_ok=True)
+        forget(context, "consistency", [path, context.workspace.final])
         return report.write(context.workspace)
     report.items = len(context.pairs)
     # An adjustment may fail, and succeed when it is tried again.
     report.fingerprint = fingerprint(VERSION, recipe, adjust.current_fingerprint(context), bool(adjusted.poses))
-    last = context.workspace.stage_report("consistency")
-    if not context.overwrite and path.is_file() and last.is_file():
-        before = read_json(last)
-        result = ConsistencyResult.of_json(before.get("result"))
-        if result and before.get("fingerprint") == report.fingerprint and _whole(context.workspace, result):
-            report.skipped, report.result = report.items, result
-            return report.write(context.workspace)
-    # A killed run must not leave what the report of an earlier one vouches for.
-    for stale in (last, context.workspace.final):
-        with translated_os_errors(stale):
-            stale.unlink(missing_ok=True)
+    if report.is_up_to_date(context):
+        return report.write(context.workspace)
+    forget(context, "consistency", [context.workspace.final])
     with context.executor.step("consistency"):
         cameras = adjusted.cameras_of(context.block)
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
@@ -82,9 +71,11 @@ def run(context: Context) -> StageReport:
         if mask.any()
     }
     write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
-    block = _left_of(context, adjusted, entries)
+    block, files = _left_of(context, adjusted, entries), [path]
     if block is not adjusted:
         write_atomically(context.workspace.final, lambda stream: write_adjusted(stream, block))
+        files.append(context.workspace.final)
+    report.vouches_for(context.workspace, files)
     left = _connection_left(context, entries)
     matches = sum(len(before.matches.indices) for _, before in entries)
     report.result = ConsistencyResult(
@@ -142,14 +133,6 @@ def final_block(context: Context) -> AdjustedBlock | None:
     adjusted = adjust.adjusted_block(context)
     path = context.workspace.final_or_adjusted
     return adjusted if adjusted is None or path == context.workspace.adjusted else read_adjusted(path)
-
-
-def _whole(workspace: Workspace, result: ConsistencyResult) -> bool:
-    """Whether the files that a report vouches for are there. Raises BrokenFileError where one is damaged."""
-    load_checked(workspace.dropped, ())
-    if workspace.final.is_file():
-        load_checked(workspace.final, ())
-    return workspace.final.is_file() == (result.observations_left < result.observations)
 
 
 def _left_of(context: Context, adjusted: AdjustedBlock, entries: Iterable[tuple[Pair, VerifiedEntry]]) -> AdjustedBlock:

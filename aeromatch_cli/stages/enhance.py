@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Image
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.files import whole_record, write_atomically, write_record
+from aeromatch_cli.files import changed_files, digests, read_json, write_atomically, write_json
 from aeromatch_cli.fingerprints import fingerprint, mask_fingerprint, picture_fingerprint
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.masks import mask_path, sees_sky
@@ -148,8 +149,9 @@ def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
         write_atomically(task.workspace.enhanced(task.image_id, ".mask.png"), lambda s: write_png(s, mask))
     if kept.pop(".json"):
         names = [f"{task.image_id}{suffix}" for suffix, wanted in kept.items() if wanted]
+        path = task.workspace.enhanced(task.image_id, ".json")
         head = {"fingerprint": task.fingerprint, "picture": stays, **result.info}
-        write_record(task.workspace.enhanced(task.image_id, ".json"), head, names)
+        write_json(path, {**head, "files": digests(path.parent, names)})
 
 
 def _remove(task: EnhanceTask, suffixes: Iterable[str]) -> None:
@@ -208,4 +210,11 @@ def _has_picture(task: EnhanceTask) -> bool:
 
 
 def _record(task: EnhanceTask) -> dict[str, Any]:
-    return whole_record(task.workspace.enhanced(task.image_id, ".json"))
+    return whole(task.workspace.enhanced(task.image_id, ".json"))
+
+
+def whole(path: Path) -> dict[str, Any]:
+    """Return the record of what was made of an image, where the files that it names are as they were written; else
+    nothing."""
+    record = read_json(path) if path.is_file() else {}
+    return {} if changed_files(path.parent, record.get("files", {})) else record

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, Ground
-from aeromatch_cli.files import read_json, translated_os_errors, whole_record, write_bytes, write_record, write_text
+from aeromatch_cli.files import read_json, translated_os_errors, write_bytes, write_json, write_text
 from aeromatch_cli.fingerprints import fingerprint, mask_fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
@@ -37,13 +38,15 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
 from aeromatch_cli.stages.messages import frame_remarks
 from aeromatch_cli.stages.models import best_mapped, evidence_of
-from aeromatch_cli.stages.stage_report import StageReport, gather_failures
+from aeromatch_cli.stages.stage_report import StageReport, forget, gather_failures, whole_record
 from aeromatch_cli.stages.swapped_axes import exchanged_columns
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 
 # The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
 VERSION, _LARGE_BLOCK_VERSION = 24, 1
+# What was found, of what, and which pairs the first pass has verified.
+_DATA = "orientation/orientation.json"
 # What failures.csv calls the mapper's process.
 _MAPPING = "mapping"
 
@@ -65,7 +68,7 @@ def run(
     # A block that grows large is oriented anew, but where its images were.
     report.fingerprint = fingerprint(images, settings, first_pass.is_large(context.block))
     before = _on_file(context)
-    record = before if before.get("fingerprint") == report.fingerprint else None
+    record: Mapping[str, Any] | None = before if before.get("fingerprint") == report.fingerprint else None
     if record is None and dry:
         return context, report
     recipe = first_pass.fitted(recipe, context.block)
@@ -76,11 +79,11 @@ def run(
         same = before.get("settings") == settings
         kept = {i for i, value in images.items() if same and before.get("images", {}).get(i) == value}
         solution, seen = _solution(context, recipe, kept, before)
-        head = {"fingerprint": report.fingerprint, "settings": settings, "images": images}
-        record = _write(context, solution, {**head, **seen})
+        record = _write(context, solution, {"settings": settings, "images": images, **seen})
         report.done = report.items
     else:
         report.skipped = report.items
+    report.vouches_for(context.workspace, _files(context, record))
     folder = context.workspace.orientation
     found = OrientResult(**record["result"])
     ground, source, ground_remarks = judged_ground(context, _terrains(context, record), found)
@@ -228,18 +231,21 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
 
 
 def _on_file(context: Context) -> Mapping[str, Any]:
-    """The record of an earlier run whose files are as they were written, else nothing."""
-    return {} if context.overwrite else whole_record(context.workspace.orientation / "orientation.json", say=True)
+    """What an earlier run has found and of what, where its files are as they were written; else nothing."""
+    report = whole_record(context, "orient")
+    if _DATA not in report.get("files", {}):
+        return {}
+    return {**read_json(context.workspace.root / _DATA), "fingerprint": report["fingerprint"]}
 
 
 def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dict[str, Any]:
-    folder = context.workspace.orientation
-    path = folder / "orientation.json"
-    with translated_os_errors(path):  # the record comes last: it vouches for the others
-        path.unlink(missing_ok=True)
+    """Write what was found; return the contents of orientation.json, which begins with `head`."""
+    workspace = context.workspace
+    folder = workspace.orientation
+    forget(context, "orient")
     write_text(folder / "cameras.csv", cameras_text(solution.cameras))
     write_text(folder / "poses.csv", poses_text(solution.poses))
-    names = ["cameras.csv", "poses.csv"]
+    names = []
     for number, terrain in enumerate(solution.terrains, start=1):
         place = terrain.west_m, terrain.north_m, terrain.cell_m
         data = terrain_bytes(terrain.heights_m, *place, *_frame(context, solution.result))
@@ -249,19 +255,24 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
         for old in set(folder.glob("terrain*.tif")) - {folder / name for name in names}:
             old.unlink(missing_ok=True)
     held = [asdict(group) for group in solution.groups]
-    write_record(path, {**head, "result": solution.result.as_json(), "groups": held}, names)
-    return read_json(path)
+    write_json(workspace.root / _DATA, {**head, "result": solution.result.as_json(), "groups": held, "terrains": names})
+    return read_json(workspace.root / _DATA)
+
+
+def _files(context: Context, record: Mapping[str, Any]) -> list[Path]:
+    """Return the files of an orientation."""
+    workspace = context.workspace
+    names = ("cameras.csv", "poses.csv", *record["terrains"])
+    return [workspace.root / _DATA, *(workspace.orientation / name for name in names)]
 
 
 def _terrains(context: Context, record: Mapping[str, Any]) -> tuple[Terrain, ...]:
     """Read the terrains on file, the largest flight's first. record: orientation.json."""
-    names = sorted(
-        (name for name in record.get("files", ()) if name.endswith(".tif")), key=lambda name: (len(name), name)
-    )
-    if not names:
+    if not record.get("terrains"):
         return ()
     origin_m, _ = _frame(context, OrientResult(**record["result"]))
-    return tuple(Terrain(*read_terrain(context.workspace.orientation / name, origin_m)) for name in names)
+    folder = context.workspace.orientation
+    return tuple(Terrain(*read_terrain(folder / name, origin_m)) for name in record["terrains"])
 
 
 def _frame(context: Context, found: OrientResult) -> tuple[FloatArray, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +12,7 @@ from aeromatch_cli.config import Settings, dump
 from aeromatch_cli.data import Block, Pair, PictureQuality
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.files import read_json, write_record, write_text
+from aeromatch_cli.files import read_json, write_json, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
 from aeromatch_cli.results.stages import OrientResult, PairsResult
@@ -83,7 +82,6 @@ def prepare(
         urgent=sorted(found.urgent),
         unread=dict(found.unread),
         images=len(found.block.images),
-        pairs_sha256=hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
     )
     report.result = result
     report.failures = list(found.failures)
@@ -93,7 +91,7 @@ def prepare(
     warn(said_later)
     _check_pairs(context)
     if not dry:
-        _write(context, pairs_csv, quality)
+        report.vouches_for(workspace, _write(context, pairs_csv, quality))
         forget_absent(context)
         report.write(workspace)
     return context, oriented, report
@@ -227,16 +225,14 @@ def _fingerprint(context: Context) -> str:
 def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
     """The pairs on file, if the report that vouches for them is about exactly this file."""
     path = workspace.stage_report("pairs")
-    if not (path.is_file() and workspace.pairs.is_file()):
-        return None
-    report = read_json(path)
-    found = PairsResult.of_json(report.get("result"))
-    if report.get("fingerprint") != wanted or found is None or found.pairs_sha256 != file_digest(workspace.pairs):
-        return None
-    return read_pairs(workspace.pairs)
+    report = read_json(path) if path.is_file() else {}
+    digest = report.get("files", {}).get(workspace.pairs.name)
+    known = report.get("fingerprint") == wanted and workspace.pairs.is_file() and file_digest(workspace.pairs) == digest
+    return read_pairs(workspace.pairs) if known else None
 
 
-def _write(context: Context, pairs_csv: str, quality: Mapping[str, PictureQuality]) -> None:
+def _write(context: Context, pairs_csv: str, quality: Mapping[str, PictureQuality]) -> list[Path]:
+    """Write settings and tables of the block; return the tables."""
     workspace, block = context.workspace, context.block
     texts = {
         workspace.images: images_text(block.images, context.image_fingerprints, quality),
@@ -247,5 +243,5 @@ def _write(context: Context, pairs_csv: str, quality: Mapping[str, PictureQualit
     write_text(workspace.config, dump(context.settings))
     for path, text in texts.items():
         write_text(path, text)
-    # Last: it vouches for the tables.
-    write_record(workspace.block, block_record(block, context.given, context.settings), [path.name for path in texts])
+    write_json(workspace.block, block_record(block, context.given, context.settings))
+    return [workspace.block, *texts]

@@ -8,16 +8,16 @@ which is read once; then every image's keypoints are measured by its patches and
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Pair, PairGeometry
-from aeromatch_cli.files import read_json, translated_os_errors, whole_record, write_atomically, write_record
+from aeromatch_cli.files import read_json, translated_os_errors, write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, read_keypoints
 from aeromatch_cli.formats.refined import write_refined
@@ -39,7 +39,7 @@ from aeromatch_cli.stages.measuring import (
     measurement_fingerprint,
     patches_of,
 )
-from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.stages.stage_report import StageReport, forget, run_stage, whole_record
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.refiners.least_squares import LeastSquares
 
@@ -51,40 +51,47 @@ _IMAGES_AT_ONCE = 128
 def run(context: Context) -> StageReport:
     """Write refined/<id>.npz of all images where they are not up to date."""
     report = StageReport("refine")
-    recipe, folder = context.settings.least_squares, context.workspace.refined_files.parent
+    recipe, folder = context.settings.least_squares, context.workspace.refined("").parent
     if recipe is None:
         _remove(folder)
         report.result = RefineResult()
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
     report.items, report.fingerprint = len(context.block.images), current_fingerprint(context)
-    record = {} if context.overwrite else whole_record(context.workspace.refined_files, say=True)
-    if record.get("asked") == report.fingerprint and _nothing_is_back(context, record["lacking"], report):
-        report.skipped, report.result = report.items - len(report.failures), RefineResult(**record["result"])
+    if _is_up_to_date(context, report):
         return report.write(context.workspace)
-    report.failures.clear()
     _make_room(context)
     with context.executor.step("refine"):
         table = _Table.of(context)
     found = _measured(context, table, recipe, report)
     report.result = _write(context, table, found, recipe)
     report.done = report.items - len(report.failures)
-    # What is made of places that lack some must not count as made of all. Measurements that failed are tried again as
-    # soon as their pictures can be read, that is with the next command.
-    lacking = sorted({item for item, _ in report.failures})
-    made = fingerprint(report.fingerprint, lacking) if lacking else report.fingerprint
-    names = sorted(path.name for path in folder.glob("*.npz"))
-    head = {"asked": report.fingerprint, "fingerprint": made, "lacking": lacking, "result": report.result.as_json()}
-    write_record(context.workspace.refined_files, head, names)
+    report.vouches_for(context.workspace, folder.glob("*.npz"))
     return report.write(context.workspace)
 
 
-def _nothing_is_back(context: Context, lacking: Sequence[str], report: StageReport) -> bool:
-    """Whether pictures of images that failed still cannot be read; then these are the failures of this run, too."""
+def _is_up_to_date(context: Context, report: StageReport) -> bool:
+    """Whether what is on file is of these matches, and nothing more can be measured: pictures of images that failed
+    still cannot be read. Then these are the failures of this run, too."""
+    record = whole_record(context, report.stage)
+    result = RefineResult.of_json(record.get("result"))
+    if record.get("fingerprint") != report.fingerprint or result is None:
+        return False
+    lacking = _lacking(record)
     sources = [source_of(context, context.image_by_id[image_id]) for image_id in lacking]
     run_stage(context, report, _read, sources, lacking)
     report.done = 0
-    return len(report.failures) == len(lacking)
+    if len(report.failures) < len(lacking):
+        report.failures.clear()
+        return False
+    report.failures = [(item, reason) for item, reason in record["failures"]]
+    report.skipped, report.result, report.files = report.items - len(lacking), result, record.get("files", {})
+    return True
+
+
+def _lacking(record: Mapping[str, Any]) -> list[str]:
+    """Images whose measurements failed; they are tried again as soon as their pictures can be read."""
+    return sorted({item for item, _ in record["failures"]})
 
 
 def _read(source: Source) -> bool:
@@ -93,9 +100,12 @@ def _read(source: Source) -> bool:
 
 
 def made_fingerprint(context: Context) -> str:
-    """Return the fingerprint of the measured places on file, "" where there are none."""
-    record = context.workspace.refined_files
-    return str(read_json(record).get("fingerprint", "")) if record.is_file() else ""
+    """Return the fingerprint of the measured places on file, "" where there are none. What is made of places that lack
+    some must not count as made of all."""
+    path = context.workspace.stage_report("refine")
+    record = read_json(path) if path.is_file() else {}
+    made = str(record.get("fingerprint", ""))
+    return fingerprint(made, lacking) if made and (lacking := _lacking(record)) else made
 
 
 def current_fingerprint(context: Context) -> str:
@@ -115,10 +125,11 @@ def _versions() -> tuple[int, str]:
 
 
 def _make_room(context: Context) -> None:
-    """Nothing is left that a record of an earlier run vouches for; measurements of images of the block stay, unless all
+    """Leave nothing that the report of an earlier run vouches for; measurements of images of the block stay, unless all
     is to be made anew."""
     workspace = context.workspace
-    folder, kept = workspace.refined_files.parent, workspace.measured("").parent
+    folder, kept = workspace.refined("").parent, workspace.measured("").parent
+    forget(context, "refine")
     if context.overwrite:
         _remove(folder)
     with translated_os_errors(kept):
@@ -208,7 +219,7 @@ def _comparable(geometry: PairGeometry) -> bool:
 def _measured(context: Context, table: _Table, recipe: LeastSquares, report: StageReport) -> Measured:
     """Measure all keypoints of the block; those of images for which nothing has changed are on file. Patches are there
     as long as they are needed: those of 10,000 images would fill a disk."""
-    folder = context.workspace.refined_files.parent
+    folder = context.workspace.refined("").parent
     by = {image_id: table.measured_by(image_id) for image_id in table.names}
     found, todo = Measured.nothing(len(table.trees.parent)), list[str]()
     for image_id in (image_id for image_id in table.names if by[image_id]):
@@ -256,7 +267,7 @@ def _task(
     sources = [table.sources[i] for i in (image_id, *by)]
     scales = {i: source.scale for i, source in zip((image_id, *by), sources, strict=True)}
     own = measurement_fingerprint(recipe, _versions(), parts, [source.fingerprint for source in sources])
-    folder, path = context.workspace.refined_files.parent, context.workspace.measured(image_id)
+    folder, path = context.workspace.refined("").parent, context.workspace.measured(image_id)
     return MeasureTask(image_id, tuple(parts), recipe, folder, scales, path, own)
 
 

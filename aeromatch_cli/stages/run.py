@@ -14,11 +14,11 @@ from aeromatch_cli import graph, report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.files import read_json, remove_stale_temporaries, translated_os_errors, whole_record
+from aeromatch_cli.files import remove_stale_temporaries, translated_os_errors
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
-from aeromatch_cli.results.stages import FilterResult, ReportResult
+from aeromatch_cli.results.stages import FilterResult
 from aeromatch_cli.stages import (
     adjust,
     cascade,
@@ -203,8 +203,7 @@ def _attempt(
         )
     names = {image.image_id: image.name for image in context.block.images}
     failures = all_failures(command, context, reports)
-    page = context.workspace.report
-    old_page = command in JUDGED and page.is_file() and _current_page(context.workspace, settings=False) is None
+    old_page = command in JUDGED and report.is_of_earlier_results(context.workspace)
     return command_result(
         command, context.settings, context.workspace, names, reports, failures, said,
         part=context.shard is not None, old_page=old_page,
@@ -268,25 +267,11 @@ def _without_keypoints(context: Context) -> str:
 
 
 def _page(context: Context) -> StageReport:
-    page = None if context.overwrite else _current_page(context.workspace)
+    page = report.kept(context)
     if page is None:
         with context.executor.step("report"):
             page = report.run(context)
     return page
-
-
-def _current_page(workspace: Workspace, *, settings: bool = True) -> StageReport | None:
-    """The page's report, where the page and everything that it tells of are as they were when it was written.
-    settings: also the list of settings, in which a run without the page differs from one with it."""
-    own = workspace.stage_report("report")
-    if not (workspace.report.is_file() and own.is_file()):
-        return None
-    before, now = (whole_record(workspace.report_files).get("told", {}), report.told_digests(workspace))
-    if not settings:
-        before, now = ({**told, workspace.config.name: ""} for told in (before, now))
-    if before != now:
-        return None
-    return StageReport("report", items=1, skipped=1, result=ReportResult.of_json(read_json(own).get("result")))
 
 
 def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:

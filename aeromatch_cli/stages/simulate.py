@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import Image, Neighbour, Pose, View
-from aeromatch_cli.files import whole_record, write_atomically, write_record
+from aeromatch_cli.files import digests, write_atomically, write_json
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import write_png
@@ -133,7 +133,7 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
             for view in (item.view for item in pictures)
         ],
     }
-    write_record(workspace.views(image_id), record, ())
+    write_json(workspace.views(image_id), record)
     if with_pictures:
         _write_pictures(task, pictures, record)
 
@@ -148,13 +148,13 @@ def _write_pictures(task: SimulateTask, pictures: Sequence[ViewPixels], record: 
     for item in pictures:
         gray = item.gray if item.valid is None else np.where(item.valid, item.gray, 0).astype(np.uint8)
         write_atomically(workspace.view(image_id, item.view.name), partial(write_png, pixels=gray))
-    write_record(workspace.view_pictures(image_id), record, names)
+    write_json(workspace.view_pictures(image_id), {**record, "files": digests(folder, names)})
 
 
 def degenerate_view(workspace: Workspace, image: Image) -> str:
     """Return what views.json says of a ground view that shows nothing, "" where there is none: the reason stated, or
     views that together have too few pixels."""
-    record = whole_record(workspace.views(image.image_id))
+    record = enhance.whole(workspace.views(image.image_id))
     if not record or record.get("remark"):
         return str(record.get("remark", ""))
     width_px, height_px = max(((v["width_px"], v["height_px"]) for v in record["views"]), key=math.prod, default=(0, 0))
@@ -190,11 +190,11 @@ def run(context: Context) -> StageReport:
 
 def is_done(task: SimulateTask) -> bool:
     """Whether the pictures on file are those that the task would make."""
-    record = whole_record(task.enhance.workspace.view_pictures(task.enhance.image_id))
+    record = enhance.whole(task.enhance.workspace.view_pictures(task.enhance.image_id))
     return is_kept(task) and record.get("fingerprint") == task.fingerprint
 
 
 def is_kept(task: SimulateTask) -> bool:
     """Whether what `keep` leaves in any case is on file."""
-    record = whole_record(task.enhance.workspace.views(task.enhance.image_id))
+    record = enhance.whole(task.enhance.workspace.views(task.enhance.image_id))
     return bool(record.get("fingerprint") == task.fingerprint)

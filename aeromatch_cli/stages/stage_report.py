@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from aeromatch_cli import graph
 from aeromatch_cli.data import Pair
 from aeromatch_cli.executor import Outcome
-from aeromatch_cli.files import read_json, write_json, write_text
+from aeromatch_cli.files import changed_files, digests, read_json, translated_os_errors, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.results.stages import StageResult
 from aeromatch_cli.stages.context import Context
@@ -33,7 +33,8 @@ class StageReport:
     """Counts what one stage did; it becomes reports/<stage>.json.
 
     items = done (made now) + skipped (up to date already) + failed; items are images, pairs or exporters. part: of a
-    step of a cascade, in words.
+    step of a cascade, in words. files: of a stage of the whole block, the files that it has written, by their names in
+    the workspace, with their SHA-256.
     """
 
     stage: str
@@ -43,6 +44,7 @@ class StageReport:
     skipped: int = 0
     fingerprint: str = ""
     result: StageResult | None = None
+    files: dict[str, str] = field(default_factory=dict)
     failures: list[tuple[str, str]] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     part: str = ""
@@ -64,6 +66,7 @@ class StageReport:
             "fingerprint": self.fingerprint,
             "result": None if self.result is None else self.result.as_json(),
             "failures": [list(failure) for failure in self.failures],
+            **({"files": self.files} if self.files else {}),
         }
         path = context_workspace.stage_report(self.stage, shard.label if shard else "")
         if not self._says_nothing_new(path) or (shard is None and _shard_failed_since(path)):
@@ -83,7 +86,49 @@ class StageReport:
         # Without a result of its own the stage only counts what it makes: the one on file still holds.
         self.result = self.result or before
         failures = [list(failure) for failure in self.failures]
-        return (old.get("failures"), old.get("fingerprint"), before) == (failures, self.fingerprint, self.result)
+        told = old.get("failures"), old.get("fingerprint"), old.get("files", {}), before
+        return told == (failures, self.fingerprint, self.files, self.result)
+
+    def vouches_for(self, workspace: Workspace, paths: Iterable[Path]) -> None:
+        """State the files that the stage has written, as they are now."""
+        self.files = digests(workspace.root, (path.relative_to(workspace.root).as_posix() for path in paths))
+
+    def is_up_to_date(self, context: Context) -> bool:
+        """Whether what a stage of the whole block has left is of this report's fingerprint, and as it was written. Then
+        the report has its result, and all items are skipped."""
+        record = whole_record(context, self.stage)
+        result = graph.BY_NAME[self.stage].result.of_json(record.get("result"))
+        if record.get("fingerprint") != self.fingerprint or record["failures"] or result is None:
+            return False
+        self.skipped, self.result, self.files = self.items, result, record.get("files", {})
+        return True
+
+
+def whole_record(context: Context, stage: str) -> dict[str, Any]:
+    """Return the report that a stage of the whole block has left, where the files that it names are as they were
+    written; else nothing, and a word says which is not. Nothing, too, where all is made anew."""
+    workspace = context.workspace
+    path = workspace.stage_report(stage)
+    if context.overwrite or not path.is_file():
+        return {}
+    record = read_json(path)
+    changed = changed_files(workspace.root, record.get("files", {}))
+    if changed:
+        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+        log.warning(
+            "warning: %s%s was changed or removed since it was written, and counts as absent",
+            workspace.root / changed[0],
+            more,
+        )
+    return {} if changed else record
+
+
+def forget(context: Context, stage: str, paths: Iterable[Path] = ()) -> None:
+    """Remove what a stage of the whole block has left: first its report, so that where the command is stopped nothing
+    vouches for what is then made of something else."""
+    for path in (context.workspace.stage_report(stage), *paths):
+        with translated_os_errors(path):
+            path.unlink(missing_ok=True)
 
 
 def result_on_file(workspace: Workspace, kind: type[R]) -> R | None:
