@@ -42,6 +42,17 @@ class Workspace:
         return self.root / ".lock"
 
     @property
+    def index(self) -> Path:
+        """What is known of the files."""
+        return self.root.absolute() / "index.sqlite"
+
+    def shard_index(self, label: str) -> Path:
+        return self.root.absolute() / f"index.{label}.sqlite"
+
+    def shard_indexes(self) -> list[Path]:
+        return sorted(self.root.absolute().glob("index.*-of-*.sqlite"))
+
+    @property
     def config(self) -> Path:
         return self.root / "config.yaml"
 

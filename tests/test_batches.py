@@ -46,7 +46,9 @@ class Together(LightGlue):
 
 
 def task(image_id1: str) -> PairTask:
-    return PairTask(PairGeometry(Pair("a", image_id1, np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None), "", 0)
+    return PairTask(
+        PairGeometry(Pair("a", image_id1, np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None), "", ("", "")
+    )
 
 
 PAIRS = [task(name) for name in ("same", "moved", "many", "few")]

@@ -11,8 +11,8 @@ import pytest
 from aeromatch_cli.data import Image
 from aeromatch_cli.files import write_text
 from aeromatch_cli.formats.tables import images_text
-from aeromatch_cli.stages.naming import item_named, names_on_file, with_names
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
+from aeromatch_cli.store.naming import item_named, names_on_file, with_names
 from aeromatch_cli.workspace import Workspace
 
 NAMES = {"flight_a_jpg": "flight/a.jpg", "b_jpg": "b b.jpg"}

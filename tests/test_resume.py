@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from conftest import IMAGES, Site, contents
 
-from aeromatch_cli.formats.rows import row_fingerprints
+from aeromatch_cli.store.block_store import BlockStore
+from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -120,8 +121,10 @@ def test_a_setting_redoes_exactly_what_depends_on_it(done_site, change, redone):
 def pair_prints(site: Site, kind: str = "matches") -> dict[tuple[str, str], str]:
     """(id0, id1) -> fingerprint of the pairs on file."""
     found = {}
+    store = BlockStore(Workspace(site.work), Index())
     for path in (site.work / kind).glob("*.npz"):
-        found |= {(path.stem, id1): value for id1, value in row_fingerprints(path).items()}
+        row = store.matches(path.stem) if kind == "matches" else store.verdicts(path.stem)
+        found |= {(path.stem, id1): one.fingerprint for id1, one in row.items()}
     return found
 
 

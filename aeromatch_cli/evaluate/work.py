@@ -18,21 +18,16 @@ from aeromatch_cli.evaluate.opening import BlockTruth
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
 from aeromatch_cli.fingerprints import file_digest
-from aeromatch_cli.formats.refined import read_final_keypoints
-from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
-from aeromatch_cli.formats.tables import read_images, read_pairs
-from aeromatch_cli.recent import recent
-from aeromatch_cli.stages.consistency import FinalEntries
-from aeromatch_cli.stages.filter import match_points
-from aeromatch_cli.workspace import Workspace, opened_workspace
+from aeromatch_cli.formats.rows import VerifiedEntry
+from aeromatch_cli.store.matches import match_points
+from aeromatch_cli.store.opened import OpenedBlock
+from aeromatch_cli.workspace import Workspace
 
 # Pairs that truly share this much count, whether they were tried or not.
 MIN_OVERLAP = 0.20
 # The quick estimate is of a coarse grid: pairs somewhat below are looked at properly.
 _QUICK_OVERLAP = 0.15
 _NAMED = 5
-# Whose keypoints are at hand: pairs go by the order of their images.
-_IMAGES_KEPT = 256
 _NOTHING: FloatArray = np.zeros((0, 2))
 
 
@@ -69,15 +64,16 @@ def evaluate_workspace(
     where a file of the workspace is missing or damaged.
     """
     started, progress = time.monotonic(), progress or SilentProgress()
-    workspace = opened_workspace(work)
+    block = OpenedBlock(work)
+    workspace = block.workspace
     truth = open_truth(truth_folder)
-    images, left_out = _judged(read_images(workspace.images), truth, truth_folder)
+    images, left_out = _judged(list(block.images.values()), truth, truth_folder)
     if truth.kind == "rendered":
         _check_pictures(workspace, images, truth, truth_folder)
-    entries = _verified(workspace)
+    known = ((pair, block.final(pair)) for pair in block.pairs)
+    entries = {(pair.image_id0, pair.image_id1): entry for pair, entry in known if entry is not None}
     if not entries:
         raise InputError(f"no pair of {work} has a verdict: run `aeromatch run`, or match and filter, first")
-    keypoints = _Keypoints(workspace)
     ordered = sorted(images, key=lambda image: image.image_id)
     rows = []
     progress.start("evaluate", len(ordered))
@@ -87,7 +83,7 @@ def evaluate_workspace(
             near = truth.near(image0.name, [image.name for image in rest])
             for image1, meets in zip(rest, near, strict=True):
                 entry = entries.get((image0.image_id, image1.image_id))
-                row = _judge(truth, image0, image1, entry, keypoints) if meets or entry is not None else None
+                row = _judge(truth, image0, image1, entry, block) if meets or entry is not None else None
                 rows += [row] if row is not None else []
             progress.advance()
     finally:
@@ -114,18 +110,6 @@ def _check_pictures(workspace: Workspace, images: Sequence[Image], truth: BlockT
             )
 
 
-class _Keypoints:
-    """Keypoints of the images of a workspace; none where an image has no features."""
-
-    def __init__(self, workspace: Workspace) -> None:
-        self._workspace = workspace
-        self._read: dict[str, FloatArray] = {}
-
-    def __getitem__(self, image_id: str) -> FloatArray:
-        paths = self._workspace.features(image_id), self._workspace.refined(image_id)
-        return recent(self._read, image_id, lambda: read_final_keypoints(*paths), _IMAGES_KEPT)
-
-
 def _judged(
     images: Sequence[Image], truth: BlockTruth, truth_folder: Path
 ) -> tuple[tuple[Image, ...], tuple[str, ...]]:
@@ -149,20 +133,8 @@ def _judged(
     return known, unknown
 
 
-def _verified(workspace: Workspace) -> dict[tuple[str, str], VerifiedEntry]:
-    """Verdicts of the pairs on the list: what an older list left behind does not count."""
-    found, rows, final = {}, dict[str, dict[str, VerifiedEntry]](), FinalEntries(workspace)
-    for pair in read_pairs(workspace.pairs):
-        if pair.image_id0 not in rows:
-            rows[pair.image_id0] = read_verified_row(workspace.verified(pair.image_id0))
-        entry = rows[pair.image_id0].get(pair.image_id1)
-        if entry is not None:
-            found[pair.image_id0, pair.image_id1] = final(pair.image_id0, entry)
-    return found
-
-
 def _judge(
-    truth: BlockTruth, image0: Image, image1: Image, entry: VerifiedEntry | None, keypoints: _Keypoints
+    truth: BlockTruth, image0: Image, image1: Image, entry: VerifiedEntry | None, block: OpenedBlock
 ) -> PairRow | None:
     """The row of one pair, None where it is neither verified nor overlaps."""
     state = NOT_TRIED if entry is None else str(entry.verdict.state)
@@ -172,7 +144,7 @@ def _judge(
     conditions = truth.conditions(image0.name, image1.name)
     if not verified and conditions.overlap < MIN_OVERLAP:
         return None
-    all0, all1 = keypoints[image0.image_id], keypoints[image1.image_id]
+    all0, all1 = block.keypoints_px(image0.image_id), block.keypoints_px(image1.image_id)
     sides, scores = (_NOTHING, _NOTHING), np.zeros(0)
     if verified and entry is not None:
         if not len(all0) or not len(all1):

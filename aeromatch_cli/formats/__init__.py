@@ -86,11 +86,11 @@ apart have one each: `terrain-2.tif` and so on.
 
 Written by `adjust`: the bundle adjustment of the verified matches. One line per image of known place, in the block's
 CRS: `image` (its name); `x`, `y`, `z` of the projection centre, metres; `omega_deg`, `phi_deg`, `kappa_deg`
-(photogrammetric, against the grid of the CRS); `sigma_x_m` to `sigma_kappa_deg`: standard deviations, empty where they
-are not known; `camera`: camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north and scale are arbitrary;
-standard deviations hold within the group, those of positions are empty), or `predicted` of an image that is not
-oriented: the position given, the attitude given or that of its strip, empty where nothing is known; `unit`: of all
-lengths of the line, `m`, or `arbitrary` in a frame of its own.
+(photogrammetric, against the grid of the CRS); `sigma_x_m` to `sigma_kappa_deg`: standard deviations, empty where
+they are not known; `camera`: camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place,
+north and scale are arbitrary; standard deviations hold within the group, those of positions are empty), or
+`predicted` of an image that is not oriented: the position given, the attitude given or that of its strip, empty where
+nothing is known; `unit`: of all lengths of the line, `m`, or `arbitrary` in a frame of its own.
 
 ### orientation/residuals.csv
 

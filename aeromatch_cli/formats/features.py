@@ -17,7 +17,6 @@ from aeromatch_cli.data import (
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.archives import load_arrays, load_checked, save_arrays
 from aeromatch_cli.formats.reading import say_damaged
-from aeromatch_cli.recent import read_once
 
 _FEATURE_ARRAYS = tuple(field.name for field in fields(Features) if field.name != "colours")
 
@@ -58,30 +57,24 @@ def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray, NDArray[np.uint8
     return arrays["keypoints_px"], arrays["sizes_px"], arrays.get("colours")
 
 
-def features_fingerprint(path: Path) -> str | None:
-    """Fingerprint recorded in a feature file, None when the file is absent or any of its arrays is broken."""
-    arrays = _checked(path, "fingerprint")
-    return None if arrays is None else str(arrays["fingerprint"])
+def checked_features(path: Path) -> tuple[str, int]:
+    """Return the fingerprint and the number of keypoints of a feature file, after all its contents were compared with
+    their checksums. Raises BrokenFileError when the file is missing or broken."""
+    arrays = load_checked(path, ("fingerprint", "keypoints_px"))
+    return str(arrays["fingerprint"]), len(arrays["keypoints_px"])
 
 
 def checked_keypoints(path: Path) -> tuple[str, FloatArray | None]:
-    """Fingerprint and keypoints (K, 2) from one reading; "" and None as `features_fingerprint` has None."""
-    arrays = _checked(path, "fingerprint", "keypoints_px")
-    return ("", None) if arrays is None else (str(arrays["fingerprint"]), arrays["keypoints_px"])
-
-
-def _checked(path: Path, *names: str) -> dict[str, NDArray[Any]] | None:
-    """None, and a word, where the file is absent or any of its arrays is broken."""
+    """Return fingerprint and keypoints (K, 2) from one reading; "" and None, with a warning, where the file is broken,
+    without one where it is absent."""
     try:
-        return load_checked(path, names)
+        arrays = load_checked(path, ("fingerprint", "keypoints_px"))
     except BrokenFileError as error:
         say_damaged(path, error)
-        return None
+        return "", None
+    return str(arrays["fingerprint"]), arrays["keypoints_px"]
 
 
-def known_fingerprint(path: Path) -> str | None:
-    """The same, read once as long as the file is not written again."""
-    return _fingerprint_read_once(path) if path.is_file() else None
-
-
-_fingerprint_read_once = read_once(1 << 16)(features_fingerprint)
+def features_fingerprint(path: Path) -> str:
+    """Return the fingerprint that a feature file states; nothing else of it is read. Raises BrokenFileError."""
+    return str(load_arrays(path, ("fingerprint",))["fingerprint"])

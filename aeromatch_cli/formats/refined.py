@@ -10,7 +10,7 @@ import numpy as np
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.archives import load_arrays, save_arrays
-from aeromatch_cli.formats.features import checked_keypoints, known_fingerprint, read_keypoints
+from aeromatch_cli.formats.features import checked_keypoints, features_fingerprint, read_keypoints
 from aeromatch_cli.formats.reading import say_damaged
 
 
@@ -26,7 +26,7 @@ def read_final_keypoints(features: Path, refined: Path) -> FloatArray:
     an image without features. Raises BrokenFileError where a file is broken."""
     if not features.is_file():
         return np.zeros((0, 2), np.float32)
-    places = _measured(refined, known_fingerprint(features))
+    places = _measured(refined, features_fingerprint(features)) if refined.is_file() else None
     return read_keypoints(features)[0] if places is None else places
 
 
@@ -42,7 +42,7 @@ def checked_final_keypoints(features: Path, refined: Path) -> tuple[str, FloatAr
     return fingerprint, detected if places is None else places
 
 
-def _measured(refined: Path, fingerprint: str | None) -> FloatArray | None:
+def _measured(refined: Path, fingerprint: str) -> FloatArray | None:
     """None where none are there of the features with this fingerprint."""
     if not refined.is_file():
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,10 +16,8 @@ from aeromatch_cli.data import (
     Matches,
     Verdict,
 )
-from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.formats.archives import ARCHIVE_FAULTS, load_all, load_checked, save_arrays
-from aeromatch_cli.formats.reading import readable, say_damaged
-from aeromatch_cli.recent import read_once
+from aeromatch_cli.formats.archives import ARCHIVE_FAULTS, load_all, save_arrays
+from aeromatch_cli.formats.reading import readable
 
 # Features of rows that earlier versions wrote.
 UNKNOWN = ("", "")
@@ -116,24 +114,6 @@ def _verified_entry(row: _Row, p: int, image_id1: str, fingerprint: str) -> Veri
         relative_rotation=None if np.isnan(rotation).any() else rotation,
     )
     return VerifiedEntry(image_id1, fingerprint, int(row["matches_in"][p]), matches, verdict, row.features(p))
-
-
-def row_fingerprints(path: Path) -> Mapping[str, str]:
-    """image_id1 -> fingerprint of a matches or verified row; empty when absent or any array is broken. Read once
-    as long as the file is not written again.
-    """
-    return _fingerprints(path) if path.is_file() else {}
-
-
-@read_once(1 << 16)
-def _fingerprints(path: Path) -> Mapping[str, str]:
-    try:
-        arrays = load_checked(path, ("image_id1", "fingerprint"))
-        with readable(path, *ARCHIVE_FAULTS):
-            return {str(i): str(f) for i, f in zip(arrays["image_id1"], arrays["fingerprint"], strict=True)}
-    except BrokenFileError as error:
-        say_damaged(path, error)
-        return {}
 
 
 class _Row:

@@ -11,18 +11,17 @@ import numpy as np
 
 from aeromatch_cli import graph
 from aeromatch_cli.config import differing, load
-from aeromatch_cli.data import Image
+from aeromatch_cli.data import Image, Pair
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.formats.rows import read_verified_row
-from aeromatch_cli.formats.tables import read_csv, read_images, read_pairs
+from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.report.better import Standing, as_facts, criteria, verdict_lines
 from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult
-from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.settings_diff import said_value
 from aeromatch_cli.stages.stage_report import result_on_file
-from aeromatch_cli.workspace import Workspace, opened_workspace
+from aeromatch_cli.store.opened import OpenedBlock
+from aeromatch_cli.workspace import Workspace
 
 _LISTED = 10
 # Settings that change no result.
@@ -164,14 +163,13 @@ def _counts(words: str, first: float, second: float) -> str:
 
 
 def _side(root: Path) -> _Side:
-    workspace = opened_workspace(root)
-    images = read_images(workspace.images)
-    names = {image.image_id: image.name for image in images}
-    quality = quality_on_file(workspace, names)
+    block = OpenedBlock(root)
+    workspace = block.workspace
+    quality = quality_on_file(workspace, block.names)
     return _Side(
         settings=load(str(workspace.config)).model_dump(mode="json"),
-        images={image.name: image for image in images},
-        matches=_matches(workspace, names),
+        images={image.name: image for image in block.images.values()},
+        matches={(block.names[p.image_id0], block.names[p.image_id1]): _final_matches(block, p) for p in block.pairs},
         seconds=seconds_by_stage(workspace),
         adjusted=result_on_file(workspace, AdjustResult),
         consistent=result_on_file(workspace, ConsistencyResult),
@@ -180,18 +178,9 @@ def _side(root: Path) -> _Side:
     )
 
 
-def _matches(workspace: Workspace, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
-    final = FinalEntries(workspace)
-    matches: dict[tuple[str, str], int] = {}
-    row_id, row = "", dict[str, Any]()
-    for pair in read_pairs(workspace.pairs) if workspace.pairs.is_file() else []:
-        if pair.image_id0 != row_id:
-            row_id, row = pair.image_id0, read_verified_row(workspace.verified(pair.image_id0))
-        found = row.get(pair.image_id1)
-        entry = None if found is None else final(pair.image_id0, found)
-        good = entry is not None and entry.verdict.state == "verified"
-        matches[names[pair.image_id0], names[pair.image_id1]] = len(entry.matches.indices) if good and entry else 0
-    return matches
+def _final_matches(block: OpenedBlock, pair: Pair) -> int:
+    entry = block.final(pair)
+    return len(entry.matches.indices) if entry is not None and entry.verdict.state == "verified" else 0
 
 
 def _oriented(workspace: Workspace) -> frozenset[str] | None:

@@ -36,7 +36,7 @@ from aeromatch_cli.results.stages import Ninths
 from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import match_points
+from aeromatch_cli.store.matches import match_points
 
 T = TypeVar("T")
 # Coverage counts the cells of a grid of this many rows and columns that hold a verified match.

@@ -26,10 +26,8 @@ from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.figures import evenly_chosen
 from aeromatch_cli.report.rows import PairRow
-from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import match_points
-from aeromatch_cli.stages.rows import check_features
+from aeromatch_cli.store.matches import FinalEntries, check_features, match_points
 from aeromatch_cli.workspace import Workspace
 
 MAX_REJECTED_PREVIEWS = 2
@@ -93,7 +91,7 @@ class DrawnMatches:
         entry: VerifiedEntry | MatchEntry | None
         if row.state == "verified":
             path, judged = self._workspace.verified(ids[0]), self._verified(ids[0]).get(ids[1])
-            entry = judged = self._final(ids[0], judged) if judged else None
+            entry = judged = self._final.left(ids[0], judged) if judged else None
             errors = judged.verdict.errors_px if judged else None
         else:
             path, entry, errors = self._workspace.matches(ids[0]), self._matched(ids[0]).get(ids[1]), None

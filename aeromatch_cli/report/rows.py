@@ -29,7 +29,7 @@ from aeromatch_cli.results.stages import (
     ViewsResult,
 )
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.naming import item_named
+from aeromatch_cli.store.naming import item_named
 from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"

@@ -7,39 +7,33 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from aeromatch_cli import graph
-from aeromatch_cli.config import Settings, load
-from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
+from aeromatch_cli.data import Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.files import read_json
-from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.archives import ARCHIVE_FAULTS
 from aeromatch_cli.formats.reading import readable
-from aeromatch_cli.formats.refined import read_final_keypoints
-from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
-from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
+from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.geometry.cameras import corner_params
 from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
 from aeromatch_cli.images.files import read_pixels
-from aeromatch_cli.images.remote import is_remote, on_disk, remote_file
+from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult
 from aeromatch_cli.stages.cascade import makers
-from aeromatch_cli.stages.consistency import FinalEntries
-from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.inspect_image import steps_of_image
 from aeromatch_cli.stages.quality import quality_on_file
-from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
 from aeromatch_cli.stages.stage_report import result_on_file
-from aeromatch_cli.workspace import Workspace, opened_workspace
+from aeromatch_cli.store.matches import match_points
+from aeromatch_cli.store.opened import OpenedBlock
+from aeromatch_cli.workspace import Workspace
 
 # Partners that are listed one by one.
 _LISTED = 30
@@ -56,43 +50,8 @@ class Shown:
     picture: Path | None = None
 
 
-class _Work:
-    """A workspace's tables, each read once."""
-
-    def __init__(self, root: Path) -> None:
-        self.workspace = opened_workspace(root)
-
-    @cached_property
-    def images(self) -> dict[str, Image]:
-        return {image.image_id: image for image in read_images(self.workspace.images)}
-
-    @cached_property
-    def poses(self) -> dict[str, Pose]:
-        return read_poses(self.workspace.poses)
-
-    @cached_property
-    def cameras(self) -> dict[str, Camera]:
-        return read_cameras(self.workspace.cameras)
-
-    @cached_property
-    def pairs(self) -> list[Pair]:
-        return read_pairs(self.workspace.pairs) if self.workspace.pairs.is_file() else []
-
-    @cached_property
-    def adjusted(self) -> AdjustedBlock | None:
-        """Of the last adjustment."""
-        return read_adjusted(self.workspace.adjusted) if self.workspace.adjusted.is_file() else None
-
-    @cached_property
-    def settings(self) -> Settings:
-        """Those of the last run, in this folder."""
-        found = load(str(self.workspace.config))
-        return found.model_copy(update={"workspace": str(self.workspace.root)})
-
-    def picture(self, image: Image) -> Path:
-        """The file of an image."""
-        folder = self.settings.block.images
-        return on_disk(remote_file(folder, image.name)) if is_remote(folder) else Path(folder) / image.name
+class _Work(OpenedBlock):
+    """The workspace that is shown."""
 
     def image(self, text: str) -> Image:
         """By name, file name, stem or id. Raises ConfigError where none or several fit."""
@@ -114,17 +73,6 @@ class _Work:
             example = next(iter(self.images.values())).name if self.images else "none"
             raise ConfigError(f"{text!r} {what} of {self.workspace.root}: give a name such as {example}")
         return (exact or fitting)[0]
-
-    def keypoints_px(self, image_id: str) -> FloatArray:
-        return read_final_keypoints(self.workspace.features(image_id), self.workspace.refined(image_id))
-
-    @cached_property
-    def _final(self) -> FinalEntries:
-        return FinalEntries(self.workspace)
-
-    def final(self, pair: Pair) -> VerifiedEntry | None:
-        found = read_verified_row(self.workspace.verified(pair.image_id0)).get(pair.image_id1)
-        return None if found is None else self._final(pair.image_id0, found)
 
 
 def show(
@@ -183,8 +131,7 @@ def _workspace(work: _Work) -> Shown:
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
     facts: dict[str, Any] = {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)}
-    names = {image_id: image.name for image_id, image in work.images.items()}
-    quality = quality_on_file(workspace, names)
+    quality = quality_on_file(workspace, work.names)
     if quality is not None:
         first, *others = [one.sentence for one in quality.faults] or ["nothing speaks against it"]
         lines += [f"result      {quality.verdict}: {first}", *(f"            {words}" for words in others)]
@@ -202,11 +149,8 @@ def _stale(work: _Work) -> str:
     """An image whose matches point into keypoints that are gone, "" where there is none among some pairs."""
     every = max(1, len(work.pairs) // _TRIED)
     for pair in work.pairs[::every]:
-        entry = read_verified_row(work.workspace.verified(pair.image_id0)).get(pair.image_id1)
-        if entry is not None and (
-            image_id := stale_image(pair.image_id0, entry, partial(features_on_file, work.workspace))
-        ):
-            return work.images[image_id].name
+        if image_id := work.stale(pair):
+            return work.names[image_id]
     return ""
 
 
@@ -289,10 +233,9 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     lines = [f"pair        {image0.name} and {image1.name}, paired by {pair.reason}"]
     if not np.isnan(pair.overlap):
         lines.append(f"overlap     {100 * pair.overlap:.0f} %, view angle {pair.view_angle_deg:.1f} degrees")
-    found, raw = work.final(pair), read_match_row(workspace.matches(ids[0])).get(ids[1])
+    found, raw = work.final(pair), work.matches(pair)
     if found is None or raw is None:
         raise InputError(f"{image0.name} and {image1.name} have no matches on file: run aeromatch match and filter")
-    check_features(workspace, ids[0], raw)
     verdict = found.verdict
     kept = found.matches if verdict.state == "verified" else None
     count = 0 if kept is None else len(kept.indices)

@@ -299,7 +299,7 @@ def _time_pairs(context: Context, sampled: Sequence[Pair], timed: Mapping[str, _
         found = [timed[i].features for i in (pair.image_id0, pair.image_id1) if i in timed]
         features0, features1 = found if len(found) == 2 else (None, None)
         if features0 is not None and features1 is not None:
-            task = PairTask(context.geometry(pair), "", pair_seed(context, pair))
+            task = PairTask(context.geometry(pair), "", ("", ""), pair_seed(context, pair))
             settings = context.settings
             shown = None
             if settings.match.reads_pixels:

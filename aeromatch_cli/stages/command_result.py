@@ -14,10 +14,10 @@ from aeromatch_cli.sfm.quality.finding import Level
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lost import Lost, lost_images, lost_lines, write_lost
 from aeromatch_cli.stages.messages import stage_lines
-from aeromatch_cli.stages.naming import item_named, names_on_file, with_names
 from aeromatch_cli.stages.quality import quality_of, results_of
 from aeromatch_cli.stages.result_summary import closing_lines, verdict_lines
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
+from aeromatch_cli.store.naming import item_named, names_on_file, with_names
 from aeromatch_cli.workspace import Workspace
 
 # Commands that end with a verdict on the block.

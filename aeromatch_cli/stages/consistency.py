@@ -7,15 +7,14 @@ for all who read final results.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair, Verdict
+from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair
 from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
-from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
+from aeromatch_cli.formats.dropped import Dropped, write_dropped
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
 from aeromatch_cli.results.stages import ConsistencyResult, FilterResult, Ninths
@@ -25,10 +24,9 @@ from aeromatch_cli.sfm.two_view_poses import placed_alone
 from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import Judged, connection, select, verified_pairs
-from aeromatch_cli.stages.rows import check_features
+from aeromatch_cli.stages.filter import Judged, connection, verified_pairs
 from aeromatch_cli.stages.stage_report import StageReport, forget
-from aeromatch_cli.workspace import Workspace
+from aeromatch_cli.store.matches import FinalEntries
 
 VERSION = 7
 
@@ -182,50 +180,3 @@ def final_pairs(context: Context, features: Callable[[str], str] | None = None) 
     final = FinalEntries(context.workspace)
     for pair, entry in verified_pairs(context, features):
         yield pair, final.left(pair.image_id0, entry)  # of present keypoints: stale ones are none of those pairs
-
-
-class FinalEntries:
-    """Gives what is left of verified entries, by what a workspace has on file; all, where that is of other results.
-
-    Raises WorkspaceError for an entry whose features were made again since.
-    """
-
-    def __init__(self, workspace: Workspace) -> None:
-        self._workspace = workspace
-        self._dropped, self._least = read_dropped(workspace.dropped)
-
-    def kept(self, image_id0: str, entry: VerifiedEntry) -> BoolArray:
-        """(M,) of an entry's matches: none where so few are left that the pair is rejected."""
-        keep = self._not_dropped(image_id0, entry)
-        if keep is None:
-            return np.ones(len(entry.matches.indices), dtype=bool)
-        return keep if keep.sum() >= self._least else np.zeros(len(keep), dtype=bool)
-
-    def _not_dropped(self, image_id0: str, entry: VerifiedEntry) -> BoolArray | None:
-        """(M,) of an entry's matches; None where none is dropped."""
-        made_of, rows = self._dropped.get((image_id0, entry.image_id1), ("", None))
-        if rows is None or made_of != entry.fingerprint:
-            return None
-        keep = np.ones(len(entry.matches.indices), dtype=bool)
-        keep[rows] = False
-        return keep
-
-    def __call__(self, image_id0: str, entry: VerifiedEntry) -> VerifiedEntry:
-        check_features(self._workspace, image_id0, entry)
-        return self.left(image_id0, entry)
-
-    def left(self, image_id0: str, entry: VerifiedEntry) -> VerifiedEntry:
-        """Return what is left of an entry whose matches are known to be of the present features."""
-        if (keep := self._not_dropped(image_id0, entry)) is None:
-            return entry
-        left, verdict = select(entry.matches, keep), entry.verdict
-        errors = None if verdict.errors_px is None else verdict.errors_px[keep]
-        rejected = {**verdict.rejected, "consistency": int((~keep).sum())}
-        verdict = replace(verdict, keep=np.ones(len(left.indices), dtype=bool), errors_px=errors, rejected=rejected)
-        if len(left.indices) < self._least:
-            words = f"{len(left.indices)} of {len(keep)} matches are left: others contradict the block, or are unlikely"
-            nothing = np.zeros(0, dtype=bool)
-            rejected["consistency"] = len(keep)
-            verdict = Verdict(nothing, "rejected", words, rejected=rejected)
-            left = select(left, np.zeros(len(left.indices), dtype=bool))
-        return replace(entry, matches=left, verdict=verdict)

@@ -23,6 +23,8 @@ from aeromatch_cli.images.scaling import scale_within, shrink_camera
 from aeromatch_cli.sfm.focal import with_focal_length
 from aeromatch_cli.sfm.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
+from aeromatch_cli.store.block_store import BlockStore
+from aeromatch_cli.store.index import Index
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.workspace import Workspace
 
@@ -44,6 +46,7 @@ class Context:
     """Holds everything that a stage needs to know. It is made once per command by `stages.pairs.prepare`.
 
     settings: the resolved settings. workspace: the paths of the workspace's files. executor: runs the tasks of stages.
+    index: what is known of the files of the workspace.
     block: images, cameras, poses and ground in the world frame, oriented once `stages.orient` has run.
     pairs: the pairs of pairs.csv, in its order.
     image_fingerprints: image_id -> fingerprint of the image file.
@@ -91,9 +94,15 @@ class Context:
     part: str = ""
     shard: Shard | None = None
     overwrite: bool = False
+    index: Index = field(default_factory=Index, repr=False)
     known_fingerprints: dict[tuple[str, frozenset[str]], str] = field(default_factory=dict, init=False, repr=False)
     known_tasks: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
     known_pairs: dict[tuple[str, str, str], str] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def store(self) -> BlockStore:
+        """Return what the workspace holds."""
+        return BlockStore(self.workspace, self.index)
 
     @property
     def observed(self) -> Observed:

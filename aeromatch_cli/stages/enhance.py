@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from aeromatch_cli.results.stages import EnhanceResult
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import PIPELINE_VERSION, library_version
+from aeromatch_cli.store.block_store import BlockStore
 from aeromatch_cli.strategies import Enhanced, Enhancer
 from aeromatch_cli.workspace import Workspace
 
@@ -139,7 +140,7 @@ def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
     stays in any case.
     """
     picture = picture and not task.as_taken
-    stays = picture or _has_picture(task)
+    stays = picture or _has_picture(task, _read_record(task))
     kept = {".png": stays, ".mask.png": result.mask is not None, ".json": not task.as_taken}
     _remove(task, [suffix for suffix, wanted in kept.items() if not wanted])
     if picture:
@@ -149,7 +150,7 @@ def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
         write_atomically(task.workspace.enhanced(task.image_id, ".mask.png"), lambda s: write_png(s, mask))
     if kept.pop(".json"):
         names = [f"{task.image_id}{suffix}" for suffix, wanted in kept.items() if wanted]
-        path = task.workspace.enhanced(task.image_id, ".json")
+        path = _record_path(task)
         head = {"fingerprint": task.fingerprint, "picture": stays, **result.info}
         write_json(path, {**head, "files": digests(path.parent, names)})
 
@@ -169,7 +170,7 @@ def run(context: Context) -> StageReport:
     """Write enhanced/<id>.png for every image of the shard that is not up to date; none for images left as taken."""
     report = StageReport("enhance")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [task for task in tasks if not task.as_taken and (context.overwrite or not is_done(task))]
+    todo = [task for task in tasks if not task.as_taken and (context.overwrite or not is_done(context.store, task))]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
     for task in tasks:
         if task.as_taken:
@@ -193,28 +194,27 @@ def skipped_images(tasks: Iterable[EnhanceTask]) -> int | None:
     return sum(asked) if asked else None
 
 
-def is_done(task: EnhanceTask) -> bool:
+def is_done(store: BlockStore, task: EnhanceTask) -> bool:
     """Whether the picture on file is the one that the task would make, if it makes any."""
-    return task.as_taken or _has_picture(task)
+    return task.as_taken or _has_picture(task, store.record(_record_path(task)))
 
 
-def is_kept(task: EnhanceTask) -> bool:
+def is_kept(store: BlockStore, task: EnhanceTask) -> bool:
     """Whether what `keep` leaves in any case is on file."""
-    return task.as_taken or _record(task).get("fingerprint") == task.fingerprint
+    return task.as_taken or store.record(_record_path(task)).get("fingerprint") == task.fingerprint
 
 
-def _has_picture(task: EnhanceTask) -> bool:
+def _has_picture(task: EnhanceTask, record: Mapping[str, Any]) -> bool:
     """Whether the picture on file is of these very settings and inputs."""
-    record = {} if task.as_taken else _record(task)
-    return record.get("fingerprint") == task.fingerprint and bool(record["picture"])
+    return not task.as_taken and record.get("fingerprint") == task.fingerprint and bool(record["picture"])
 
 
-def _record(task: EnhanceTask) -> dict[str, Any]:
-    return whole(task.workspace.enhanced(task.image_id, ".json"))
+def _record_path(task: EnhanceTask) -> Path:
+    return task.workspace.enhanced(task.image_id, ".json")
 
 
-def whole(path: Path) -> dict[str, Any]:
-    """Return the record of what was made of an image, where the files that it names are as they were written; else
-    nothing."""
+def _read_record(task: EnhanceTask) -> dict[str, Any]:
+    """Return the record of an image where its files are as they were written; else nothing."""
+    path = _record_path(task)
     record = read_json(path) if path.is_file() else {}
     return {} if changed_files(path.parent, record.get("files", {})) else record

@@ -11,13 +11,14 @@ import numpy as np
 from aeromatch_cli.data import Features, Image
 from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
-from aeromatch_cli.formats.features import known_fingerprint, write_features
+from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
 from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.results.stages import ExtractResult, StageResult
 from aeromatch_cli.stages import enhance, simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.store.block_store import BlockStore, KnownFeatures
 from aeromatch_cli.strategies import Extractor
 
 
@@ -50,9 +51,10 @@ def make_task(context: Context, image: Image) -> ExtractTask:
 
 @dataclass(frozen=True)
 class Extracted:
-    """Counts what was found in one image, and what its views cost."""
+    """What was found in one image, and what its views cost."""
 
-    keypoints: int
+    image_id: str
+    features: KnownFeatures
     cost: simulate.ViewCost
 
 
@@ -71,7 +73,8 @@ def run_task(task: ExtractTask) -> Extracted:
     enhance.keep(task.views.enhance, enhancement, picture=task.keep_images)
     simulate.keep(task.views, pictures, with_pictures=task.keep_images)
     write_atomically(task.path, lambda stream: write_features(stream, features, task.fingerprint))
-    return Extracted(len(features.keypoints_px), simulate.ViewCost.of(pictures))
+    known = KnownFeatures(task.fingerprint, len(features.keypoints_px))
+    return Extracted(task.image_id, known, simulate.ViewCost.of(pictures))
 
 
 def in_stored_frame(features: Features, scale: float) -> Features:
@@ -102,11 +105,14 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     report = before or StageReport("extract")
     chosen = [image.image_id for image in context.images()] if image_ids is None else sorted(set(image_ids))
     tasks = [task_of(context, image_id) for image_id in chosen]
-    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    todo = [task for task in tasks if context.overwrite or not _is_done(context.store, task)]
     report.items += len(tasks)
     report.skipped += len(tasks) - len(todo)
     network = any(task.extractor.network for task in todo)
     made = run_stage(context, report, run_task, todo, [task.image_id for task in todo], network=network)
+    for one in made:
+        context.store.made_features(one.image_id, one.features)
+    context.index.flush()
     if made:
         report.result = _result(made, tasks, report.result)
     report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
@@ -115,7 +121,7 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
 
 def _result(made: Sequence[Extracted], tasks: Sequence[ExtractTask], before: StageResult | None) -> ExtractResult:
     """Summarise the images made now, and those that the same command has made before."""
-    counts = [item.keypoints for item in made]
+    counts = [item.features.keypoints for item in made]
     found = ExtractResult(
         keypoints=sum(counts),
         images_without_keypoints=sum(count == 0 for count in counts),
@@ -134,18 +140,19 @@ def run_own_first(context: Context, image_ids: Iterable[str]) -> StageReport:
     return run(replace(context, overwrite=False), ids - own, report) if own < ids else report
 
 
-def _is_done(task: ExtractTask) -> bool:
+def _is_done(store: BlockStore, task: ExtractTask) -> bool:
     source = task.views.enhance
-    if known_fingerprint(task.path) != task.fingerprint:
+    if store.features_fingerprint(task.image_id) != task.fingerprint:
         return False
     if task.keep_images:
-        return enhance.is_done(source) and simulate.is_done(task.views)
-    return enhance.is_kept(source) and simulate.is_kept(task.views)
+        return enhance.is_done(store, source) and simulate.is_done(store, task.views)
+    return enhance.is_kept(store, source) and simulate.is_kept(store, task.views)
 
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:
     """Return those of the images whose features on file are the ones that the present settings and inputs give."""
-    return {i for i in set(image_ids) if known_fingerprint(context.workspace.features(i)) == wanted(context, i)}
+    store = context.store
+    return {i for i in set(image_ids) if (known := store.features(i)) and known.fingerprint == wanted(context, i)}
 
 
 def wanted(context: Context, image_id: str) -> str:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,6 @@ from aeromatch_cli.formats.rows import (
     VerifiedEntry,
     read_match_row,
     read_verified_row,
-    row_fingerprints,
     write_verified_row,
 )
 from aeromatch_cli.geometry.components import labels_by_name
@@ -29,9 +27,11 @@ from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import FilterResult
 from aeromatch_cli.stages import extract, match, rows
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.rows import PairTask
-from aeromatch_cli.stages.stage_report import StageReport, run_stage, unexplained
+from aeromatch_cli.stages.rows import PairTask, RowResult, run_rows
+from aeromatch_cli.stages.stage_report import StageReport, unexplained
 from aeromatch_cli.stages.versions import library_version
+from aeromatch_cli.store.block_store import KnownVerdict, stale_image, verdicts_of
+from aeromatch_cli.store.matches import match_points, select
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
 from aeromatch_cli.strategies.filters.chain import Filter
@@ -54,14 +54,6 @@ class FilterTask:
     chain: tuple[Filter, ...]
     workspace: Workspace
     overwrite: bool
-
-
-@dataclass(frozen=True)
-class RowResult:
-    """done: pairs judged now. failures: ("id0 id1", reason)."""
-
-    done: int
-    failures: tuple[tuple[str, str], ...]
 
 
 def pair_seed(context: Context, pair: Pair) -> int:
@@ -93,27 +85,28 @@ def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
     features = extract.current(context, {i for r in rows.values() for p in r for i in (p.image_id0, p.image_id1)})
     tasks, missing = [], []
     for image_id0, pairs in rows.items():
-        matched = row_fingerprints(context.workspace.matches(image_id0))
-        row = []
+        matched, row = context.store.matches(image_id0), []
         for pair in pairs:
             known = {pair.image_id0, pair.image_id1} <= features
-            if known and matched.get(pair.image_id1) == match.pair_fingerprint(context, pair):
+            on_file = matched.get(pair.image_id1)
+            if known and on_file and on_file.fingerprint == match.pair_fingerprint(context, pair):
                 own = pair_fingerprint(context, pair)
-                row.append(PairTask(context.geometry(pair), own, pair_seed(context, pair)))
+                row.append(PairTask(context.geometry(pair), own, on_file.features, pair_seed(context, pair)))
             else:
                 missing.append(pair)
         tasks.append(FilterTask(image_id0, tuple(row), context.settings.filter, context.workspace, context.overwrite))
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0)), missing
 
 
-def run_task(task: FilterTask) -> RowResult:
+def run_task(task: FilterTask) -> RowResult[KnownVerdict]:
     """Judge what is not up to date in one row."""
     path = task.workspace.verified(task.image_id0)
     old = rows.readable(read_verified_row, path, task.overwrite)
     matched = read_match_row(task.workspace.matches(task.image_id0))
     row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _judge(task, pair, matched[pair.image_id1]))
     write_atomically(path, lambda stream: write_verified_row(stream, row.entries))
-    return RowResult(len(row.made), row.failures)
+    found = sum(len(entry.matches.indices) for entry in row.made)
+    return RowResult(task.image_id0, len(row.made), found, row.failures, verdicts_of(row.entries))
 
 
 def _judge(task: FilterTask, pair: PairTask, entry: MatchEntry) -> VerifiedEntry:
@@ -124,23 +117,7 @@ def _judge(task: FilterTask, pair: PairTask, entry: MatchEntry) -> VerifiedEntry
     verdict = replace(verdict, keep=np.ones(len(kept.indices), dtype=bool), errors_px=errors)
     if entry.matches.remark:
         verdict = replace(verdict, reason=entry.matches.remark)
-    features = rows.features_of(task.workspace, task.image_id0, entry.image_id1)
-    return VerifiedEntry(entry.image_id1, pair.fingerprint, len(entry.matches.indices), kept, verdict, features)
-
-
-def match_points(matches: Matches, keypoints0: FloatArray, keypoints1: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return stored-pixel points (M, 2) float64 of both sides: keypoints, or the measured place where there is none."""
-    sides = []
-    for side, (keypoints, measured) in enumerate(((keypoints0, matches.points0_px), (keypoints1, matches.points1_px))):
-        indices = matches.indices[:, side]
-        if measured is None:
-            sides.append(keypoints[indices].astype(np.float64))
-        else:
-            points = np.array(measured, dtype=np.float64)
-            found = indices >= 0
-            points[found] = keypoints[indices[found]]
-            sides.append(points)
-    return sides[0], sides[1]
+    return VerifiedEntry(entry.image_id1, pair.fingerprint, len(entry.matches.indices), kept, verdict, pair.features)
 
 
 def candidates(matches: Matches, side0: Side, side1: Side) -> Candidates:
@@ -149,18 +126,6 @@ def candidates(matches: Matches, side0: Side, side1: Side) -> Candidates:
     if side0[1] is None or side1[1] is None or (matches.indices < 0).any():
         return Candidates(*points)
     return Candidates(*points, side0[1][matches.indices[:, 0]], side1[1][matches.indices[:, 1]])
-
-
-def select(matches: Matches, keep: Any) -> Matches:
-    """Return the matches where `keep` (M,) is true."""
-    return Matches(
-        matches.indices[keep],
-        matches.scores[keep],
-        matches.view_pairs[keep],
-        None if matches.points0_px is None else matches.points0_px[keep],
-        None if matches.points1_px is None else matches.points1_px[keep],
-        None if matches.sigmas_px is None else matches.sigmas_px[keep],
-    )
 
 
 @read_once(256)
@@ -173,16 +138,9 @@ def run(context: Context) -> StageReport:
     """Write verified/<id0>.npz for every row of the shard, then sum up what the block now is."""
     report = StageReport("filter")
     tasks, missing = make_tasks(context)
-    on_file = {task.image_id0: row_fingerprints(context.workspace.verified(task.image_id0)) for task in tasks}
-    todo = [task for task in tasks if context.overwrite or not rows.is_done(task.pairs, on_file[task.image_id0])]
-    report.items = sum(len(task.pairs) for task in tasks)
-    results = run_stage(
-        context, report, run_task, todo, [task.image_id0 for task in todo], [len(task.pairs) for task in todo]
-    )
-    report.failures.extend(failure for result in results for failure in result.failures)
+    store = context.store
+    run_rows(context, report, run_task, tasks, store.verdicts, store.made_verdicts)
     report.failures.extend(unexplained(context, missing, "match"))
-    report.done = sum(result.done for result in results)
-    report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
     ids = sorted(image.image_id for image in context.block.images)
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs), ids)
     report.result = _result_on_file(context, report) or connection(context)
@@ -204,24 +162,36 @@ def outdated_pairs(context: Context) -> list[Pair]:
     features = extract.current(context, {i for p in context.pairs for i in (p.image_id0, p.image_id1)})
     outdated = []
     for image_id0, pairs in context.rows().items():
-        judged = row_fingerprints(context.workspace.verified(image_id0))
+        judged = context.store.verdicts(image_id0)
         for pair in pairs:
-            known = {pair.image_id0, pair.image_id1} <= features
-            if not known or judged.get(pair.image_id1) != pair_fingerprint(context, pair):
+            known, verdict = {pair.image_id0, pair.image_id1} <= features, judged.get(pair.image_id1)
+            if not known or verdict is None or verdict.fingerprint != pair_fingerprint(context, pair):
                 outdated.append(pair)
     return outdated
 
 
+def known_verdicts(context: Context) -> Iterator[tuple[Pair, KnownVerdict]]:
+    """Yield what is known of judged pairs, as `verified_pairs` has them, without their matches."""
+    row_id, row = "", dict[str, KnownVerdict]()
+    features = cache(context.store.features_fingerprint)
+    for pair in context.pairs:
+        if pair.image_id0 != row_id:
+            row_id, row = pair.image_id0, context.store.verdicts(pair.image_id0)
+        known = row.get(pair.image_id1)
+        if known is not None and not stale_image((pair.image_id0, pair.image_id1), known.features, features):
+            yield pair, known
+
+
 def verified_pairs(context: Context, features: Callable[[str], str] | None = None) -> Judged:
     """Return judged pairs in the order of pairs.csv: stale rows, of older pair lists or features that were made again
-    since, cannot leak. features: fingerprint of an image's features, "" of none; by default from its file."""
+    since, cannot leak. features: fingerprint of an image's features, "" of none; by default that on file."""
     row_id, row = "", dict[str, VerifiedEntry]()
-    features = features or cache(partial(rows.features_on_file, context.workspace))
+    features = features or cache(context.store.features_fingerprint)
     for pair in context.pairs:
         if pair.image_id0 != row_id:
             row_id, row = pair.image_id0, read_verified_row(context.workspace.verified(pair.image_id0))
         entry = row.get(pair.image_id1)
-        if entry is not None and not rows.stale_image(pair.image_id0, entry, features):
+        if entry is not None and not stale_image((pair.image_id0, pair.image_id1), entry.features, features):
             yield pair, entry
 
 
@@ -233,8 +203,7 @@ def connection(context: Context, judged: Iterable[tuple[str, str, str, int]] | N
     """
     if judged is None:
         judged = (
-            (pair.image_id0, pair.image_id1, entry.verdict.state, len(entry.matches.indices))
-            for pair, entry in verified_pairs(context)
+            (pair.image_id0, pair.image_id1, known.state, known.matches) for pair, known in known_verdicts(context)
         )
     states: Counter[str] = Counter()
     ties: Counter[str] = Counter()

@@ -11,7 +11,7 @@ from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_features
-from aeromatch_cli.formats.rows import MatchEntry, read_match_row, row_fingerprints, write_match_row
+from aeromatch_cli.formats.rows import MatchEntry, read_match_row, write_match_row
 from aeromatch_cli.images.source import Source
 from aeromatch_cli.images.stored import StoredRaster
 from aeromatch_cli.recent import read_once
@@ -20,9 +20,10 @@ from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.enhance import check_unchanged
-from aeromatch_cli.stages.rows import PairTask
-from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.stages.rows import PairTask, RowResult, run_rows
+from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
+from aeromatch_cli.store.block_store import KnownMatches, matches_of
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.matchers.descriptors.search import Search
 from aeromatch_cli.workspace import Workspace
@@ -39,15 +40,6 @@ class MatchTask:
     overwrite: bool
     # By image_id, for a matcher that reads pixels.
     sources: Mapping[str, Source] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class RowResult:
-    """done: pairs matched now. found: matches in them. failures: ("id0 id1", reason)."""
-
-    done: int
-    found: int
-    failures: tuple[tuple[str, str], ...]
 
 
 def matcher_of(context: Context, pair: Pair) -> Matcher:
@@ -92,7 +84,9 @@ def make_tasks(context: Context) -> list[MatchTask]:
     tasks = []
     for image_id0, pairs in context.rows().items():
         usable = [p for p in pairs if p.image_id0 in features and p.image_id1 in features]
-        row = tuple(PairTask(context.geometry(p), pair_fingerprint(context, p), seed=0) for p in usable)
+        row = tuple(
+            PairTask(context.geometry(p), pair_fingerprint(context, p), _features_wanted(context, p)) for p in usable
+        )
         if row:
             ids = (image_id0, *(pair.image_id1 for pair in row)) if context.settings.match.reads_pixels else ()
             sources = {image_id: extract.task_of(context, image_id).views.enhance.source for image_id in ids}
@@ -102,7 +96,11 @@ def make_tasks(context: Context) -> list[MatchTask]:
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
 
 
-def run_task(task: MatchTask) -> RowResult:
+def _features_wanted(context: Context, pair: Pair) -> tuple[str, str]:
+    return extract.wanted(context, pair.image_id0), extract.wanted(context, pair.image_id1)
+
+
+def run_task(task: MatchTask) -> RowResult[KnownMatches]:
     """Match what is not up to date in one row."""
     path = task.workspace.matches(task.image_id0)
     old = rows.readable(read_match_row, path, task.overwrite)
@@ -112,7 +110,8 @@ def run_task(task: MatchTask) -> RowResult:
     scanned = None if first is None else read_match_row(first.matches(task.image_id0))
     row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead, scanned))
     write_atomically(path, lambda stream: write_match_row(stream, row.entries))
-    return RowResult(len(row.made), sum(len(entry.matches.indices) for entry in row.made), row.failures)
+    found = sum(len(entry.matches.indices) for entry in row.made)
+    return RowResult(task.image_id0, len(row.made), found, row.failures, matches_of(row.entries))
 
 
 def _match_pair(
@@ -125,11 +124,10 @@ def _match_pair(
     """ahead: matches of pairs that are there already, which are taken out. scanned: what the step before has found in
     the same features."""
     ids, matcher = (task.image_id0, pair.image_id1), task.matchers[pair.image_id1]
-    features = rows.features_of(task.workspace, *ids)
     matches = ahead.pop(pair.image_id1, None)
     if matches is None and scanned is not None and isinstance(matcher, Search) and not matcher.network:
         before = scanned.get(pair.image_id1)
-        if before is None or before.features != features:
+        if before is None or before.features != pair.features:
             raise ItemError("the step before has no matches of these features: run the same command again")
         matches = matcher.again(*_sides(task, pair, features0), pair.geometry, before.matches)
     if matches is None:
@@ -137,7 +135,7 @@ def _match_pair(
         matches = compared(matcher, _sides(task, pair, features0), pair.geometry, sources)
         for source in sources or ():
             check_unchanged(source)
-    return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches, features)
+    return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches, pair.features)
 
 
 def _sides(task: MatchTask, pair: PairTask, features0: Features) -> tuple[Features, Features]:
@@ -167,15 +165,9 @@ def run(context: Context) -> StageReport:
     """Write matches/<id0>.npz for every row of the shard, from the features that are up to date."""
     report = StageReport("match")
     tasks = make_tasks(context)
-    on_file = {task.image_id0: row_fingerprints(context.workspace.matches(task.image_id0)) for task in tasks}
-    todo = [task for task in tasks if context.overwrite or not rows.is_done(task.pairs, on_file[task.image_id0])]
-    report.items = sum(len(task.pairs) for task in tasks)
-    names, sizes = [task.image_id0 for task in todo], [len(task.pairs) for task in todo]
-    network = any(matcher.network for task in todo for matcher in task.matchers.values())
-    results = run_stage(context, report, run_task, todo, names, sizes, network=network)
-    report.failures.extend(failure for result in results for failure in result.failures)
-    report.done = sum(result.done for result in results)
-    report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
+    network = any(matcher.network for task in tasks for matcher in task.matchers.values())
+    store = context.store
+    results = run_rows(context, report, run_task, tasks, store.matches, store.made_matches, network=network)
     if report.done:
         report.result = MatchResult(matches=sum(result.found for result in results))
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))

@@ -23,6 +23,7 @@ from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network
 from aeromatch_cli.stages.messages import orientation_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, forget_absent
+from aeromatch_cli.store.index import Index
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.workspace import Workspace
 
@@ -34,6 +35,7 @@ def prepare(
     executor: Executor,
     say: Callable[[str], None] = lambda _line: None,
     *,
+    index: Index | None = None,
     shard: Shard | None = None,
     overwrite: bool = False,
     dry: bool = False,
@@ -41,9 +43,9 @@ def prepare(
 ) -> tuple[Context, StageReport, StageReport]:
     """Read the block, orient it, choose the pairs and, unless `dry`, write what the block is.
 
-    say: gets the lines of the summary as soon as each is known. exports: whether the command ends with an export, whose
-    refusals come at once, and not after hours. Returns the context and the reports of orient and
-    pairs.
+    say: gets the lines of the summary as soon as each is known. index: what is known of the workspace's files. exports:
+    whether the command ends with an export, whose refusals come at once, and not after hours. Returns the context and
+    the reports of orient and pairs.
 
     Raises ConfigError for wrong input lists, InputError when no image or no pair is left, WorkspaceError when the
     workspace cannot be written.
@@ -60,7 +62,7 @@ def prepare(
     _check_images(found.block)
     for exporter in settings.export if exports else ():
         exporter.check_images(found.block.images)
-    given = _context(settings, workspace, executor, found, shard, overwrite)
+    given = _context(settings, workspace, executor, index or Index(), found, shard, overwrite)
     quality = picture_quality.measured(given, dry=dry)
     looks = picture_quality.remarks(given, quality)
     warn(looks)
@@ -165,6 +167,7 @@ def _context(
     settings: Settings,
     workspace: Workspace,
     executor: Executor,
+    index: Index,
     found: BlockRead,
     shard: Shard | None,
     overwrite: bool,
@@ -174,6 +177,7 @@ def _context(
         settings=settings,
         workspace=workspace,
         executor=executor,
+        index=index,
         block=found.block,
         pairs=(),
         image_fingerprints=found.image_fingerprints,

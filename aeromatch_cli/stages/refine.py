@@ -19,7 +19,7 @@ import numpy as np
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Pair, PairGeometry
 from aeromatch_cli.files import read_json, translated_os_errors, write_atomically
 from aeromatch_cli.fingerprints import fingerprint
-from aeromatch_cli.formats.features import known_fingerprint, read_keypoints
+from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.refined import write_refined
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.results.stages import RefineResult
@@ -293,7 +293,7 @@ def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquare
             part, indices = table.part(image_id), table.indices[image_id]
             places[indices] += moved[part]
             measured[indices] = held[part] | (table.trees.depth[part] == 0)
-        features = known_fingerprint(context.workspace.features(image_id)) or ""
+        features = context.store.features_fingerprint(image_id)
         write_atomically(context.workspace.refined(image_id), partial(_written, (places, measured, features)))
     lengths = np.linalg.norm(moved[held], axis=1)
     return RefineResult(

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from aeromatch_cli.data import PairGeometry
-from aeromatch_cli.errors import BrokenFileError, WorkspaceError
+from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.executor import guarded
-from aeromatch_cli.formats.features import known_fingerprint
-from aeromatch_cli.formats.rows import UNKNOWN, MatchEntry, VerifiedEntry
-from aeromatch_cli.stages.naming import names_on_file
-from aeromatch_cli.workspace import Workspace
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.stage_report import StageReport, run_stage
 
 
 class Entry(Protocol):
@@ -29,15 +26,50 @@ E = TypeVar("E", bound=Entry)
 
 @dataclass(frozen=True, eq=False)
 class PairTask:
-    """One pair of a row: its geometry, the fingerprint that its result must carry, and the seed of what is random."""
+    """One pair of a row: its geometry, the fingerprint that its result must carry, the fingerprints of both images'
+    features, and the seed of what is random."""
 
     geometry: PairGeometry
     fingerprint: str
-    seed: int
+    features: tuple[str, str]
+    seed: int = 0
 
     @property
     def image_id1(self) -> str:
         return self.geometry.pair.image_id1
+
+
+class RowTask(Protocol):
+    """Asks for all pairs of one image."""
+
+    @property
+    def image_id0(self) -> str: ...
+
+    @property
+    def pairs(self) -> tuple[PairTask, ...]: ...
+
+
+class Known(Protocol):
+    """Requires of what is known of a pair on file that it says of what the pair was made."""
+
+    @property
+    def fingerprint(self) -> str: ...
+
+
+K = TypeVar("K", bound=Known)
+T = TypeVar("T", bound=RowTask)
+
+
+@dataclass(frozen=True)
+class RowResult(Generic[K]):
+    """What became of a row. done, found: pairs that were made now, and their matches. failures: ("id0 id1", reason).
+    known: of all pairs that are on file now, by image_id1."""
+
+    image_id0: str
+    done: int
+    found: int
+    failures: tuple[tuple[str, str], ...]
+    known: Mapping[str, K]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,44 +104,6 @@ def missing(pairs: Sequence[PairTask], old: Mapping[str, E]) -> list[PairTask]:
     return [pair for pair in pairs if on_file.get(pair.image_id1) != pair.fingerprint]
 
 
-def features_of(workspace: Workspace, image_id0: str, image_id1: str) -> tuple[str, str]:
-    """Return the fingerprints of the features on file: what an entry that is made now points into."""
-    return features_on_file(workspace, image_id0), features_on_file(workspace, image_id1)
-
-
-def features_on_file(workspace: Workspace, image_id: str) -> str:
-    """Return the fingerprint of an image's features, "" of none."""
-    return known_fingerprint(workspace.features(image_id)) or ""
-
-
-def stale_image(image_id0: str, entry: MatchEntry | VerifiedEntry, features: Callable[[str], str]) -> str:
-    """Return the image whose features were made again after the pair was matched, so that its matches' numbers mean
-    other keypoints; "" where there is none. features: `features_on_file` of a workspace."""
-    if entry.features == UNKNOWN:
-        return ""
-    for image_id, made_of in zip((image_id0, entry.image_id1), entry.features, strict=True):
-        if features(image_id) not in (made_of, ""):
-            return image_id
-    return ""
-
-
-def check_features(
-    workspace: Workspace,
-    image_id0: str,
-    entry: MatchEntry | VerifiedEntry,
-    features: Callable[[str], str] | None = None,
-) -> None:
-    """Raises WorkspaceError where an entry's matches point into features that are no longer there. features: as
-    `stale_image` has them, by default from their files."""
-    if image_id := stale_image(image_id0, entry, features or partial(features_on_file, workspace)):
-        name = names_on_file(workspace).get(image_id, image_id)
-        raise WorkspaceError(
-            f"{workspace.root}: the keypoints of {name} were found again with other settings or inputs after it "
-            "was matched, so that its matches no longer hold: run `aeromatch match` and then `aeromatch filter`, or "
-            "`aeromatch run`"
-        )
-
-
 def readable(read: Callable[[Path], dict[str, E]], path: Path, overwrite: bool) -> dict[str, E]:
     """Return the row on file as far as it is wanted and can be read: a broken file is made again."""
     if overwrite:
@@ -120,12 +114,35 @@ def readable(read: Callable[[Path], dict[str, E]], path: Path, overwrite: bool) 
         return {}
 
 
-def is_done(pairs: Sequence[PairTask], on_file: Mapping[str, str]) -> bool:
-    """Return whether exactly the wanted pairs are there, each up to date: pairs that are no longer wanted leave the
-    file."""
-    return dict(on_file) == {pair.image_id1: pair.fingerprint for pair in pairs}
+def run_rows(
+    context: Context,
+    report: StageReport,
+    work: Callable[[T], RowResult[K]],
+    tasks: Sequence[T],
+    on_file: Callable[[str], Mapping[str, K]],
+    learn: Callable[[str, Mapping[str, K]], None],
+    *,
+    network: bool = False,
+) -> list[RowResult[K]]:
+    """Bring the rows of a stage up to date, and count its pairs in the report; return what became of those that were
+    not. A row is up to date where it holds exactly the wanted pairs, each of the wanted fingerprint.
 
-
-def kept(pairs: Sequence[PairTask], on_file: Mapping[str, str]) -> int:
-    """Count the wanted pairs that are on file and up to date."""
-    return sum(on_file.get(pair.image_id1) == pair.fingerprint for pair in pairs)
+    work: makes a row. on_file: gives what is known of a row by its image_id0. learn: is told what it holds now.
+    network: whether the tasks run one.
+    """
+    todo = []
+    for task in tasks:
+        known = {image_id1: one.fingerprint for image_id1, one in on_file(task.image_id0).items()}
+        wanted = {pair.image_id1: pair.fingerprint for pair in task.pairs}
+        report.items += len(wanted)
+        report.skipped += 0 if context.overwrite else sum(known.get(i) == made_of for i, made_of in wanted.items())
+        if context.overwrite or known != wanted:
+            todo.append(task)
+    names, sizes = [task.image_id0 for task in todo], [len(task.pairs) for task in todo]
+    results = run_stage(context, report, work, todo, names, sizes, network=network)
+    for result in results:
+        learn(result.image_id0, result.known)
+        report.failures.extend(result.failures)
+    context.index.flush()
+    report.done = sum(result.done for result in results)
+    return results

@@ -6,7 +6,7 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -49,6 +49,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace, locked
 
 log = logging.getLogger("aeromatch")
@@ -96,8 +97,11 @@ def execute(
             if before is not None:
                 return named(_unchanged(settings, before, Said(say)), root)
             run = settings.run
-            with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
-                result = _repairing(command, settings, executor, part, overwrite, Said(say))
+            with (
+                Executor(run.executor, run.jobs, progress, run.scheduler) as executor,
+                _index(Workspace(root.absolute()), command, part) as index,
+            ):
+                result = _repairing(command, settings, executor, index, part, overwrite, Said(say))
             if whole and not result.failures:
                 up_to_date.remember(Workspace(root), inputs, result.reports)
             return named(result, root)
@@ -141,14 +145,28 @@ def _nothing_left_of_a_failed_start(workspace: Workspace, *, shared: bool) -> It
         raise
 
 
+@contextmanager
+def _index(workspace: Workspace, command: str, part: Shard | None) -> Iterator[Index]:
+    """What is known of the files of a workspace; what the command learns is kept. Of shards each keeps an index of its
+    own, which the command for the whole block takes over."""
+    if command == "check":
+        yield Index(workspace.index, read_only=True)
+        return
+    index = Index(workspace.index if part is None else workspace.shard_index(part.label))
+    if part is None:
+        index.merge(workspace.shard_indexes())
+    with closing(index):
+        yield index
+
+
 def _repairing(
-    command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: Said
+    command: str, settings: Settings, executor: Executor, index: Index, part: Shard | None, overwrite: bool, said: Said
 ) -> Result:
     """Repeats the command until it meets no damaged file; each one is deleted, so that it is made again."""
     repaired: set[str] = set()
     while True:
         try:
-            return _attempt(command, settings, executor, part, overwrite, said)
+            return _attempt(command, settings, executor, index, part, overwrite, said)
         except BrokenFileError as error:
             if command == "check" or error.path in repaired:
                 raise
@@ -169,7 +187,7 @@ def _makes(command: str, workspace: Workspace, path: Path) -> bool:
 
 
 def _attempt(
-    command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: Said
+    command: str, settings: Settings, executor: Executor, index: Index, part: Shard | None, overwrite: bool, said: Said
 ) -> Result:
     dry = command == "check"
     workspace = Workspace(Path(settings.workspace))
@@ -180,7 +198,7 @@ def _attempt(
         said(f"changed          {words}")
     exports = command in _EXPORTING
     context, *reports = pairs.prepare(
-        settings, executor, said, shard=part, overwrite=overwrite, dry=dry, exports=exports
+        settings, executor, said, index=index, shard=part, overwrite=overwrite, dry=dry, exports=exports
     )
     if command == "check":
         return _check(context, reports[0], reports[-1], said)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import Image, Neighbour, Pose, View
-from aeromatch_cli.files import digests, write_atomically, write_json
+from aeromatch_cli.files import digests, read_json, write_atomically, write_json
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import write_png
@@ -20,6 +20,7 @@ from aeromatch_cli.results.stages import ViewsResult
 from aeromatch_cli.stages import enhance
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.store.block_store import BlockStore
 from aeromatch_cli.strategies import Simulator, ViewPixels
 from aeromatch_cli.strategies.simulators import source_view
 from aeromatch_cli.workspace import Workspace
@@ -154,7 +155,8 @@ def _write_pictures(task: SimulateTask, pictures: Sequence[ViewPixels], record: 
 def degenerate_view(workspace: Workspace, image: Image) -> str:
     """Return what views.json says of a ground view that shows nothing, "" where there is none: the reason stated, or
     views that together have too few pixels."""
-    record = enhance.whole(workspace.views(image.image_id))
+    path = workspace.views(image.image_id)
+    record = read_json(path) if path.is_file() else {}
     if not record or record.get("remark"):
         return str(record.get("remark", ""))
     width_px, height_px = max(((v["width_px"], v["height_px"]) for v in record["views"]), key=math.prod, default=(0, 0))
@@ -179,7 +181,7 @@ def run(context: Context) -> StageReport:
     """Write simulated/<id>/ for every image of the shard that is not up to date."""
     report = StageReport("simulate")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [task for task in tasks if context.overwrite or not is_done(task)]
+    todo = [task for task in tasks if context.overwrite or not is_done(context.store, task)]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
     costs = run_stage(context, report, _run_task, todo, [task.enhance.image_id for task in todo])
     if costs:
@@ -188,13 +190,13 @@ def run(context: Context) -> StageReport:
     return report.write(context.workspace, context.shard)
 
 
-def is_done(task: SimulateTask) -> bool:
+def is_done(store: BlockStore, task: SimulateTask) -> bool:
     """Whether the pictures on file are those that the task would make."""
-    record = enhance.whole(task.enhance.workspace.view_pictures(task.enhance.image_id))
-    return is_kept(task) and record.get("fingerprint") == task.fingerprint
+    record = store.record(task.enhance.workspace.view_pictures(task.enhance.image_id))
+    return is_kept(store, task) and record.get("fingerprint") == task.fingerprint
 
 
-def is_kept(task: SimulateTask) -> bool:
+def is_kept(store: BlockStore, task: SimulateTask) -> bool:
     """Whether what `keep` leaves in any case is on file."""
-    record = enhance.whole(task.enhance.workspace.views(task.enhance.image_id))
+    record = store.record(task.enhance.workspace.views(task.enhance.image_id))
     return bool(record.get("fingerprint") == task.fingerprint)

@@ -17,8 +17,8 @@ from aeromatch_cli.files import changed_files, digests, read_json, translated_os
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.results.stages import StageResult
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.naming import item_named, names_on_file
 from aeromatch_cli.stages.shard import Shard
+from aeromatch_cli.store.naming import item_named, names_on_file
 from aeromatch_cli.workspace import Workspace
 
 T = TypeVar("T")

@@ -17,13 +17,12 @@ import numpy as np
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches, Pair
 from aeromatch_cli.files import write_atomically, write_text
 from aeromatch_cli.fingerprints import fingerprint
-from aeromatch_cli.formats.features import known_fingerprint, read_joined, read_keypoints, write_joined
+from aeromatch_cli.formats.features import read_joined, read_keypoints, write_joined
 from aeromatch_cli.formats.rows import (
     MatchEntry,
     VerifiedEntry,
     read_match_row,
     read_verified_row,
-    row_fingerprints,
     write_match_row,
 )
 from aeromatch_cli.formats.tables import csv_text
@@ -32,8 +31,9 @@ from aeromatch_cli.results.stages import ExtractResult, MatchResult
 from aeromatch_cli.stages import cascade, extract, match
 from aeromatch_cli.stages.cascade import StepContext
 from aeromatch_cli.stages.context import Context, Union
-from aeromatch_cli.stages.rows import features_of
+from aeromatch_cli.stages.rows import PairTask, RowResult, run_rows
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, result_on_file, run_stage
+from aeromatch_cli.store.block_store import KnownFeatures, KnownMatches, matches_of
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.workspace import Workspace
 
@@ -55,12 +55,12 @@ class KeypointsTask:
 
 
 @dataclass(frozen=True, eq=False)
-class RowTask:
-    """Asks for the merging of all pairs of one image. pairs: image_id1 -> fingerprint; steps: by image_id1, the name of
-    the step whose features the matches use, and the workspace that has them."""
+class JoinTask:
+    """Asks for the merging of all pairs of one image. steps: by image_id1, the name of the step whose features the
+    matches use, and the workspace that has them."""
 
     image_id0: str
-    pairs: Mapping[str, str]
+    pairs: tuple[PairTask, ...]
     steps: Mapping[str, tuple[tuple[str, Workspace], ...]]
     workspace: Workspace
 
@@ -79,8 +79,9 @@ def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
         key = pair.image_id0, pair.image_id1
         found = []
         for step in _matched(steps, pair):
-            verified = row_fingerprints(step.context.workspace.verified(key[0])).get(key[1])
-            found.append((step.name, match.pair_fingerprint(step.context, pair), verified))
+            verdict = step.context.store.verdicts(key[0]).get(key[1])
+            judged = None if verdict is None else verdict.fingerprint
+            found.append((step.name, match.pair_fingerprint(step.context, pair), judged))
         matches[key] = fingerprint(VERSION, found, features[key[0]], features[key[1]])
     return replace(context, union=Union(features, matches))
 
@@ -97,7 +98,8 @@ def _matched(steps: Sequence[StepContext], pair: Pair) -> list[StepContext]:
         step
         for step in steps
         if (id0, id1) in step.reasons
-        and row_fingerprints(step.context.workspace.matches(id0)).get(id1) == match.pair_fingerprint(step.context, pair)
+        and (known := step.context.store.matches(id0).get(id1)) is not None
+        and known.fingerprint == match.pair_fingerprint(step.context, pair)
     ]
 
 
@@ -119,10 +121,11 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
         own = [step for step, ready in usable if image_id in ready]
         joined += bool(own)
         wanted = context.union.features[image_id]
-        if own and (context.overwrite or known_fingerprint(context.workspace.features(image_id)) != wanted):
+        if own and (context.overwrite or context.store.features_fingerprint(image_id) != wanted):
             paths = tuple((step.name, step.context.workspace.features(image_id)) for step in own)
             tasks.append(KeypointsTask(image_id, paths, context.workspace, wanted))
-    run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks])
+    for image_id, known in run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks]):
+        context.store.made_features(image_id, known)
     # An image that fails in one step has the keypoints of the others.
     report.skipped = joined - len(tasks)
     found = result_on_file(steps[0].context.workspace, ExtractResult)
@@ -149,14 +152,14 @@ def _count_seconds(report: StageReport, steps: Sequence[StepContext], stages: Co
     report.started -= sum(one.seconds for step in steps for one in step.reports if one.stage in stages)
 
 
-def join_keypoints(task: KeypointsTask) -> int:
-    """Write features/<id>.npz of one image; how many keypoints it has."""
+def join_keypoints(task: KeypointsTask) -> tuple[str, KnownFeatures]:
+    """Write features/<id>.npz of one image; return what is known of it."""
     parts = [(name, *read_keypoints(path)) for name, path in task.steps]
     joined = joined_keypoints([(name, places, sizes) for name, places, sizes, _ in parts])
     write_atomically(
         task.workspace.features(task.image_id), lambda stream: write_joined(stream, joined, task.fingerprint)
     )
-    return len(joined.keypoints_px)
+    return task.image_id, KnownFeatures(task.fingerprint, len(joined.keypoints_px))
 
 
 def joined_keypoints(parts: Sequence[tuple[str, FloatArray, FloatArray]]) -> JoinedKeypoints:
@@ -190,42 +193,41 @@ def joined_keypoints(parts: Sequence[tuple[str, FloatArray, FloatArray]]) -> Joi
 
 
 def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport:
-    assert context.union is not None
     report = StageReport("match")
     _count_seconds(report, steps, ["match", "filter"])
+    tasks, store = _join_tasks(context, steps), context.store
+    run_rows(context, report, join_row, tasks, store.matches, store.made_matches)
+    # Pairs that a step could not verify take no further step, and the last filter sees but what the others found.
+    report.failures += _failures(steps, "match", "filter")
+    outcomes = cascade.outcomes(context, steps)
+    by = Counter(outcome.settled_by for outcome in outcomes.values())
+    report.result = MatchResult(
+        matches=sum(known.matches for task in tasks for known in store.matches(task.image_id0).values()),
+        settled_by={step.name: by[step.name] for step in steps},
+        not_settled=by[""],
+    )
+    _write_steps(context, steps, outcomes)
+    report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
+    return report.write(context.workspace)
+
+
+def _join_tasks(context: Context, steps: Sequence[StepContext]) -> list[JoinTask]:
+    """Return one task per row that has a pair with matches."""
+    assert context.union is not None
     tasks, ready = [], extract.current(context, {image.image_id for image in context.block.images})
     for image_id0, pairs in context.rows().items():
-        wanted, own = {}, {}
+        wanted, own = [], {}
         for pair in pairs:
             key = pair.image_id0, pair.image_id1
             # Of several steps with the same features the last one's matches count.
             known = {step.features_of: step.context.workspace for step in _matched(steps, pair)}
             if known and set(key) <= ready:
-                wanted[key[1]], own[key[1]] = context.union.matches[key], tuple(known.items())
-        tasks.append(RowTask(image_id0, wanted, own, context.workspace))
-    tasks = [task for task in tasks if task.pairs]
-    report.items = sum(len(task.pairs) for task in tasks)
-    todo = [
-        task
-        for task in tasks
-        if context.overwrite or row_fingerprints(context.workspace.matches(task.image_id0)) != dict(task.pairs)
-    ]
-    counts = run_stage(context, report, join_row, todo, [task.image_id0 for task in todo])
-    failed = {image_id0 for image_id0, _ in report.failures}
-    report.done = sum(len(task.pairs) for task in todo if task.image_id0 not in failed)
-    report.skipped = report.items - sum(len(task.pairs) for task in todo)
-    # Pairs that a step could not verify take no further step, and the last filter sees but what the others found.
-    report.failures += _failures(steps, "match", "filter")
-    if len(counts) < len(tasks):
-        counts = [_matches_on_file(task) for task in tasks]
-    outcomes = cascade.outcomes(context, steps)
-    by = Counter(outcome.settled_by for outcome in outcomes.values())
-    report.result = MatchResult(
-        matches=sum(counts), settled_by={step.name: by[step.name] for step in steps}, not_settled=by[""]
-    )
-    _write_steps(context, steps, outcomes)
-    report.fingerprint = fingerprint(sorted(fp for task in tasks for fp in task.pairs.values()))
-    return report.write(context.workspace)
+                features = context.union.features[key[0]], context.union.features[key[1]]
+                wanted.append(PairTask(context.geometry(pair), context.union.matches[key], features))
+                own[key[1]] = tuple(known.items())
+        if wanted:
+            tasks.append(JoinTask(image_id0, tuple(wanted), own, context.workspace))
+    return tasks
 
 
 def _write_steps(context: Context, steps: Sequence[StepContext], outcomes: Mapping[Key, cascade.Outcome]) -> None:
@@ -245,27 +247,25 @@ def _write_steps(context: Context, steps: Sequence[StepContext], outcomes: Mappi
     write_text(context.workspace.steps, csv_text(header, lines))
 
 
-def join_row(task: RowTask) -> int:
-    """Write matches/<id0>.npz of one row; how many matches it has."""
+def join_row(task: JoinTask) -> RowResult[KnownMatches]:
+    """Write matches/<id0>.npz of one row."""
     keypoints0 = _joined(task.workspace.features(task.image_id0))
     raw = {w: read_match_row(w.matches(task.image_id0)) for w in _workspaces(task)}
     kept = {w: read_verified_row(w.verified(task.image_id0)) for w in raw}
     entries = []
-    for image_id1, own in task.pairs.items():
+    for pair in task.pairs:
+        image_id1 = pair.image_id1
         keypoints1 = _joined(task.workspace.features(image_id1))
         parts = [(name, raw[w][image_id1], kept[w].get(image_id1)) for name, w in task.steps[image_id1]]
         names = "+".join(dict.fromkeys(entry.strategy for _, entry, _ in parts))
-        features = features_of(task.workspace, task.image_id0, image_id1)
-        entries.append(MatchEntry(image_id1, own, names, joined_matches(parts, keypoints0, keypoints1), features))
+        matches = joined_matches(parts, keypoints0, keypoints1)
+        entries.append(MatchEntry(image_id1, pair.fingerprint, names, matches, pair.features))
     write_atomically(task.workspace.matches(task.image_id0), lambda stream: write_match_row(stream, entries))
-    return sum(len(entry.matches.indices) for entry in entries)
+    found = sum(len(entry.matches.indices) for entry in entries)
+    return RowResult(task.image_id0, len(entries), found, (), matches_of(entries))
 
 
-def _matches_on_file(task: RowTask) -> int:
-    return sum(len(entry.matches.indices) for entry in read_match_row(task.workspace.matches(task.image_id0)).values())
-
-
-def _workspaces(task: RowTask) -> set[Workspace]:
+def _workspaces(task: JoinTask) -> set[Workspace]:
     return {workspace for own in task.steps.values() for _, workspace in own}
 
 

@@ -18,16 +18,12 @@ import numpy as np
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.formats.refined import read_final_keypoints
-from aeromatch_cli.formats.rows import read_verified_row
-from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.lab.rendered import RenderedTruth
 from aeromatch_cli.lab.synthetic import load_truth
-from aeromatch_cli.stages.consistency import FinalEntries
-from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.run import execute
-from aeromatch_cli.workspace import Workspace
+from aeromatch_cli.store.matches import match_points
+from aeromatch_cli.store.opened import OpenedBlock
 from benchmarks import options
 from benchmarks.peers.base import Options, Scene
 from benchmarks.peers.matching import RATIO, mutual_nearest
@@ -105,11 +101,11 @@ def _sift(block: Path, truth: RenderedTruth, name0: str, name1: str, keypoints: 
 
 def _preset(work: Path, truth: RenderedTruth, name0: str, name1: str, preset: str) -> Side:
     """The verified matches of the pair in the workspace."""
-    workspace = Workspace(work)
-    ids = {image.name: image.image_id for image in read_images(workspace.images)}
-    entry = FinalEntries(workspace)(ids[name0], read_verified_row(workspace.verified(ids[name0]))[ids[name1]])
-    pair_ids = ids[name0], ids[name1]
-    all_px = [read_final_keypoints(workspace.features(i), workspace.refined(i)) for i in pair_ids]
+    block = OpenedBlock(work)
+    pair = next(p for p in block.pairs if (block.names[p.image_id0], block.names[p.image_id1]) == (name0, name1))
+    entry = block.final(pair)
+    assert entry is not None
+    all_px = [block.keypoints_px(i) for i in (pair.image_id0, pair.image_id1)]
     points = match_points(entry.matches, *all_px)
     return _judged(f"preset {preset}", truth, (name0, name1), all_px, points, entry.matches.scores)
 
