@@ -260,8 +260,8 @@ def _copied(rendered: Path, folder: Path, settings: tuple[str, ...] = ()) -> Sit
 
 # --- comparing workspaces -----------------------------------------------------------------------------------------
 
-# The page tells the time at which it was made, finished.json those of all files.
-_NOT_COMPARED = ("report/index.html", "reports/report.json", "finished.json")
+# The page tells the time at which it was made, the index and finished.json those of all files.
+_NOT_COMPARED = ("report/index.html", "reports/report.json", "finished.json", "index.sqlite")
 
 
 def contents(work: Path) -> dict[str, Any]:

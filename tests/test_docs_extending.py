@@ -129,7 +129,9 @@ def test_names_of_the_page_are_new() -> None:
     assert "connections" not in graph.BY_NAME
 
 
-def test_the_stage_writes_its_table_where_it_is_not_up_to_date(made: dict[str, Any], tmp_path: Path) -> None:
+def test_the_stage_writes_its_table_where_it_is_not_up_to_date(
+    made: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     module = made["connections"]
     pairs = tuple(Pair("a", second, 0.5, 10.0, "overlap") for second in ("b", "c"))
     entries = [
@@ -138,13 +140,17 @@ def test_the_stage_writes_its_table_where_it_is_not_up_to_date(made: dict[str, A
     ]
     context = SimpleNamespace(workspace=Workspace(tmp_path), pairs=pairs, overwrite=False)
     module.with_current_pairs = lambda context: (context, [])
-    module.pair_fingerprint = lambda _, pair: pair.image_id1
+    declared = graph.Stage("connections", "block", module.ConnectionsResult)
+    monkeypatch.setattr(graph, "BY_NAME", {**graph.BY_NAME, "connections": declared})
+    module.inputs_fingerprint = lambda *_: "some verdicts"
     module.final_pairs = lambda _: entries
     first, second = module.run(context), module.run(context)
     assert ((first.done, first.skipped), (second.done, second.skipped)) == ((1, 0), (0, 1))
     assert first.result.connected_pairs == second.result.connected_pairs == 1
     assert (tmp_path / "connections.csv").read_text(encoding="utf-8").splitlines()[1:] == ["a,b,7"]
-    module.pair_fingerprint = lambda _, pair: pair.image_id1 + " with other settings"
+    (tmp_path / "connections.csv").unlink()
+    assert module.run(context).done == 1
+    module.inputs_fingerprint = lambda *_: "other verdicts"
     assert module.run(context).done == 1
 
 

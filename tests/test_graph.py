@@ -18,7 +18,7 @@ from aeromatch_cli.cli import stage_commands
 from aeromatch_cli.stages import cascade, orient, pairs, run, union
 
 # Reports, the list of failures and the lock are kept by all stages alike.
-BOOKKEEPING = ("reports/*", "failures.csv", "lost.csv", ".lock", "finished.json", "*.tmp")
+BOOKKEEPING = ("reports/*", "failures.csv", "lost.csv", ".lock", "finished.json", "index.sqlite*", "*.tmp")
 
 
 def test_what_follows_from_the_declarations() -> None:

@@ -25,10 +25,10 @@ from aeromatch_cli.sfm.block_figures import block_figures
 from aeromatch_cli.sfm.calibration import held_by
 from aeromatch_cli.sfm.mapping import Group, adjust_block
 from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
-from aeromatch_cli.stages import orient, refine
+from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import pair_fingerprint
+from aeromatch_cli.stages.inputs import inputs_fingerprint
 from aeromatch_cli.stages.stage_report import StageReport, forget
 from aeromatch_cli.stages.surveyed import control_of_block, control_remarks, counted_from_below, height_remarks
 from aeromatch_cli.stages.unregistered import unregistered_reasons
@@ -50,7 +50,7 @@ def run(context: Context) -> StageReport:
         _remove(context)
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
-    report.fingerprint = _fingerprint(context, groups)
+    report.fingerprint = _fingerprint(context)
     if report.is_up_to_date(context):
         return report.write(context.workspace)
     _remove(context)
@@ -93,24 +93,13 @@ def _groups(context: Context) -> Sequence[Group]:
 
 def _is_current(context: Context, groups: Sequence[Group]) -> bool:
     made_now = replace(context, overwrite=False)
-    if not groups:
-        return False
-    return StageReport("adjust", fingerprint=_fingerprint(context, groups)).is_up_to_date(made_now)
+    return bool(groups) and StageReport("adjust", fingerprint=_fingerprint(context)).is_up_to_date(made_now)
 
 
-def current_fingerprint(context: Context) -> str:
-    """Return the fingerprint that the adjustment of the present results must carry."""
-    return _fingerprint(context, orient.groups(context))
-
-
-def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
-    block, observed = context.block, context.observed
+def _fingerprint(context: Context) -> str:
+    """Return the fingerprint of what the adjustment reads, and of what was given."""
+    observed = context.observed
     poses = {i: (pose.center_m, pose.axis_sigmas_m, pose.sigma_angle_deg) for i, pose in observed.poses.items()}
-    ids = sorted(image.image_id for image in block.images)
-    state = [ids, sorted(block.cameras.items()), sorted(block.poses.items()), sorted(poses.items())]
-    pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
-    versions = VERSION, library_version("pycolmap")
-    held = [(group.kind, group.images) for group in groups]
     control = [
         (p.name, p.position_m, p.sigmas_m, p.check, p.sigma_px, sorted(p.pixels.items())) for p in observed.control
     ]
@@ -118,8 +107,8 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
         sorted(part.items())
         for part in (observed.focal_sigmas, observed.cameras, observed.angles, observed.flights, observed.velocities)
     ]
-    how = context.settings.orient, context.settings.adjust.model_dump()
-    return fingerprint(versions, *how, held, state, known, pairs, control, refine.made_fingerprint(context))
+    how = VERSION, library_version("pycolmap"), context.settings.orient, context.settings.adjust.model_dump()
+    return fingerprint(how, inputs_fingerprint(context, "adjust"), sorted(poses.items()), known, control)
 
 
 def _remove(context: Context) -> None:

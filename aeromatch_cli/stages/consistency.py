@@ -25,6 +25,7 @@ from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, connection, verified_pairs
+from aeromatch_cli.stages.inputs import inputs_fingerprint
 from aeromatch_cli.stages.stage_report import StageReport, forget
 from aeromatch_cli.store.matches import FinalEntries
 
@@ -49,8 +50,7 @@ def run(context: Context) -> StageReport:
         forget(context, "consistency", [path, context.workspace.final])
         return report.write(context.workspace)
     report.items = len(context.pairs)
-    # An adjustment may fail, and succeed when it is tried again.
-    report.fingerprint = fingerprint(VERSION, recipe, adjust.current_fingerprint(context), bool(adjusted.poses))
+    report.fingerprint = fingerprint(VERSION, recipe, inputs_fingerprint(context, "consistency"), bool(adjusted.poses))
     if report.is_up_to_date(context):
         return report.write(context.workspace)
     forget(context, "consistency", [context.workspace.final])

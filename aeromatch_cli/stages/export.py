@@ -5,17 +5,15 @@ from __future__ import annotations
 import logging
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.fingerprints import file_digest, fingerprint
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.results.stages import Exported, ExportResult
-from aeromatch_cli.stages import refine
 from aeromatch_cli.stages.consistency import final_block, final_pairs
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import pair_fingerprint
+from aeromatch_cli.stages.inputs import inputs_fingerprint
 from aeromatch_cli.stages.stage_report import StageReport, forget, run_stage, unexplained, whole_record
 from aeromatch_cli.strategies import Strategy
 
@@ -35,23 +33,10 @@ class ExportTask:
 def run(context: Context) -> StageReport:
     """Write export/<name>/ for every exporter whose folder is not up to date."""
     report = StageReport("export")
-    block = context.block
     context, outdated = with_current_pairs(context)
     adjusted = final_block(context)
-    contents: list[Any] = [
-        block.images,
-        sorted(block.cameras.items()),
-        sorted(block.poses.items()),
-        sorted(context.given.poses.items()),
-        block.crs,
-        block.origin_m,
-        sorted(context.guessed_cameras),
-        [(pair.image_id0, pair.image_id1, pair_fingerprint(context, pair)) for pair in context.pairs],
-        refine.made_fingerprint(context),
-        None if adjusted is None else file_digest(context.workspace.final_or_adjusted),
-        file_digest(context.workspace.dropped) if context.workspace.dropped.is_file() else None,
-    ]
-    wanted = fingerprint(context.settings.export, contents)
+    given = sorted(context.given.poses.items()), sorted(context.guessed_cameras)
+    wanted = fingerprint(context.settings.export, inputs_fingerprint(context, "export"), given, adjusted is None)
     report.items, report.fingerprint = len(context.settings.export), wanted
     folders = [context.workspace.export(exporter.name) for exporter in context.settings.export]
     record = whole_record(context, "export")

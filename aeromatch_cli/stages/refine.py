@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Pair, PairGeometry
-from aeromatch_cli.files import read_json, translated_os_errors, write_atomically
+from aeromatch_cli.files import translated_os_errors, write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.refined import write_refined
@@ -27,7 +27,8 @@ from aeromatch_cli.sfm.spanning_trees import Trees, shifts_through, trees_of
 from aeromatch_cli.stages.contents import with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.enhance import source_of
-from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
+from aeromatch_cli.stages.filter import verified_pairs
+from aeromatch_cli.stages.inputs import inputs_fingerprint
 from aeromatch_cli.stages.measuring import (
     ByImage,
     CutTask,
@@ -57,7 +58,8 @@ def run(context: Context) -> StageReport:
         report.result = RefineResult()
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
-    report.items, report.fingerprint = len(context.block.images), current_fingerprint(context)
+    report.items = len(context.block.images)
+    report.fingerprint = fingerprint(*_versions(), recipe, inputs_fingerprint(context, "refine"))
     if _is_up_to_date(context, report):
         return report.write(context.workspace)
     _make_room(context)
@@ -97,27 +99,6 @@ def _lacking(record: Mapping[str, Any]) -> list[str]:
 def _read(source: Source) -> bool:
     read_source(source, colour=False)
     return True
-
-
-def made_fingerprint(context: Context) -> str:
-    """Return the fingerprint of the measured places on file, "" where there are none. What is made of places that lack
-    some must not count as made of all."""
-    path = context.workspace.stage_report("refine")
-    record = read_json(path) if path.is_file() else {}
-    made = str(record.get("fingerprint", ""))
-    return fingerprint(made, lacking) if made and (lacking := _lacking(record)) else made
-
-
-def current_fingerprint(context: Context) -> str:
-    """Return the fingerprint that measured places of the present results must carry."""
-    recipe, block = context.settings.least_squares, context.block
-    if recipe is None:
-        return ""
-    heights = [context.ground_z_m(image.image_id) for image in block.images]
-    state = [sorted(block.cameras.items()), sorted(block.poses.items()), heights]
-    sources = [source_of(context, image).fingerprint for image in block.images]
-    pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
-    return fingerprint(*_versions(), recipe, state, sources, pairs)
 
 
 def _versions() -> tuple[int, str]:
