@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,17 @@ def mask_fingerprint(path: Path) -> str:
     # A JPEG, or gray of 8 bits at most, is read as it ever was.
     alike = gray8 or head.startswith(_JPEG)
     return image_fingerprint(path) + ("" if alike else _MASKS_BY_BANDS)
+
+
+@cache
+def program_digest() -> str:
+    """SHA-256 (hex) of the size and time of every source of this program: what an earlier version has read of a file
+    may be less than this one reads."""
+    folder, digest = Path(__file__).parent, hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        status = path.stat()
+        digest.update(f"{path.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]
 
 
 def stable_hash(text: str) -> int:

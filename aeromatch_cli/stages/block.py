@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, world_crs
@@ -25,9 +28,9 @@ from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, ControlPoint, FloatArray, Ground, Image
 from aeromatch_cli.errors import BrokenFileError, ConfigError, ItemError, WorkspaceError
-from aeromatch_cli.executor import Executor
+from aeromatch_cli.executor import Executor, Outcome
 from aeromatch_cli.files import read_json
-from aeromatch_cli.fingerprints import contents_digest, picture_fingerprint
+from aeromatch_cli.fingerprints import contents_digest, picture_fingerprint, program_digest
 from aeromatch_cli.formats.tables import read_picture_quality
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
@@ -35,6 +38,7 @@ from aeromatch_cli.images.masks import mask_path
 from aeromatch_cli.images.remote import RemoteFile, is_remote, list_remote, on_disk
 from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.stages.ground import given_ground, ground_fingerprint
+from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import FORMAT_VERSION, Workspace
 
 log = logging.getLogger("aeromatch")
@@ -71,13 +75,14 @@ class BlockRead:
     ground_hint: tuple[Ground, str] | None
 
 
-def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> BlockRead:
-    """Read the inputs and the stated ground. Raises ConfigError or InputError where nothing can be started."""
+def read_block(settings: Settings, workspace: Workspace, executor: Executor, index: Index) -> BlockRead:
+    """Read the inputs and the stated ground. index: what is known of pictures that have not changed. Raises ConfigError
+    or InputError where nothing can be started."""
     if not settings.block.images:
         raise ConfigError("no images: give --images DIR, or block.images in the configuration")
     _check_folders(settings, workspace)
     before = read_json(workspace.block) if workspace.block.is_file() else {}
-    inputs, prints, remote = _read_inputs(settings, workspace, executor, before)
+    inputs, prints, remote = _read_inputs(settings, workspace, executor, index, before)
     ground, source, remarks = given_ground(settings, inputs)
     control, absent = read_control(
         settings.block.gcp,
@@ -187,7 +192,7 @@ def _mask_warnings(settings: Settings, images: Sequence[Image]) -> list[str]:
 
 
 def _read_inputs(
-    settings: Settings, workspace: Workspace, executor: Executor, before: Mapping[str, Any]
+    settings: Settings, workspace: Workspace, executor: Executor, index: Index, before: Mapping[str, Any]
 ) -> tuple[BlockInputs, dict[str, str], dict[str, RemoteFile]]:
     """Inputs, the fingerprint of every image by image_id, and by name those that lie elsewhere."""
     given, root = settings.block, Path(settings.block.images)
@@ -204,7 +209,7 @@ def _read_inputs(
     if given.masks and Path(given.masks).resolve() == root.resolve():
         passed_over = [one for one in passed_over if one.reason != MASK]
     pictures = [remote.get(name) or root / name for name in names]
-    outcomes = dict(zip(names, executor.run(_read_header, pictures, "read"), strict=True))
+    outcomes = dict(zip(names, _headers(pictures, executor, index), strict=True))
     for name, outcome in outcomes.items():
         if outcome.lost:  # without the image it would be another block, whose origin later runs would keep
             raise WorkspaceError(f"the header of {name} could not be read: {outcome.error}; run the same command again")
@@ -259,7 +264,29 @@ def _same_crs(given: str, known: str) -> bool:
     return given.strip().lower() in ("", AUTO) or checked_crs(world_crs(given)) == known
 
 
-def _read_header(picture: Path | RemoteFile) -> tuple[ExifFacts | str, str]:
+_Header = tuple[ExifFacts | str, str]
+
+
+def _headers(pictures: Sequence[Path | RemoteFile], executor: Executor, index: Index) -> list[Outcome[_Header]]:
+    """Read what the headers of pictures say, of those that have changed since the index was told."""
+    what, kind = f"header {program_digest()}", TypeAdapter(_Header)
+    found: dict[int, Outcome[_Header]] = {}
+    for place, picture in enumerate(pictures):
+        if isinstance(picture, Path):
+            with suppress(OSError):  # is told of by those who read it
+                known = index.get(what, picture.absolute())
+                if known is not None:
+                    found[place] = Outcome(kind.validate_python(known))
+    todo = [place for place in range(len(pictures)) if place not in found]
+    for place, outcome in zip(todo, executor.run(_read_header, [pictures[i] for i in todo], "read"), strict=True):
+        found[place], picture = outcome, pictures[place]
+        if outcome.value is not None and isinstance(picture, Path):
+            with suppress(OSError):
+                index.learn(what, picture.absolute(), kind.dump_python(outcome.value))
+    return [found[place] for place in range(len(pictures))]
+
+
+def _read_header(picture: Path | RemoteFile) -> _Header:
     """Return what an image's header says, or why it is unusable, and the fingerprint of the file."""
     path = on_disk(picture)
     try:

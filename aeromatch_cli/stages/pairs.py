@@ -52,7 +52,8 @@ def prepare(
     """
     report = StageReport("pairs")
     workspace = _opened(settings, dry=dry)
-    found = read_block(settings, workspace, executor)
+    index = index or Index()
+    found = read_block(settings, workspace, executor, index)
     as_given = summarise(found.block)
     given_lines = [*([f"poses            {found.recognised}"] if found.recognised else []), *as_given.given_lines()]
     for line in given_lines:
@@ -62,7 +63,7 @@ def prepare(
     _check_images(found.block)
     for exporter in settings.export if exports else ():
         exporter.check_images(found.block.images)
-    given = _context(settings, workspace, executor, index or Index(), found, shard, overwrite)
+    given = _context(settings, workspace, executor, index, found, shard, overwrite)
     quality = picture_quality.measured(given, dry=dry)
     looks = picture_quality.remarks(given, quality)
     warn(looks)

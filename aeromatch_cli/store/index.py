@@ -48,18 +48,26 @@ class Index:
         """Return what `read` finds in a file, without reading it where that is known.
 
         what: names the reader; raise its number, as in "features 2", when it finds something else in the same file.
-        The value is made of what JSON has: lists, dictionaries with names as keys, numbers, text and None. Raises
+        The value is made of what JSON has: lists, dictionaries with names as keys, numbers and text. Raises
         FileNotFoundError and what `read` raises.
         """
+        if (value := self.get(what, path)) is not None:
+            return value
         status, key = _status(path), (what, self._name(path))
-        held = self._found.get(key) or self._stored(key)
-        if held is not None and held[0] == status:
-            self._found[key] = held
-            return held[1]
         value = read(path)
         if _status(path) == status:  # else it was written again meanwhile
             self._keep(key, status, value)
         return value
+
+    def get(self, what: str, path: Path) -> Any | None:
+        """Return what `read` has found in a file as it is now, None where that is not known. Raises
+        FileNotFoundError."""
+        status, key = _status(path), (what, self._name(path))
+        held = self._found.get(key) or self._stored(key)
+        if held is None or held[0] != status:
+            return None
+        self._found[key] = held
+        return held[1]
 
     def learn(self, what: str, path: Path, value: Any) -> None:
         """Keep what `read` would find in a file that has just been written, by the word of the worker that wrote it."""
