@@ -216,8 +216,9 @@ class Block:
     coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
     distance of the images, or None where no image has an attitude; reduced_gsd_m: of them as they are worked on, None
     where none is reduced. tied: pairs (image_id0, image_id1) that a first pass has matched; similar: pairs that look
-    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found. metric:
-    whether lengths are metres; false in a frame of the pictures' own, whose scale is arbitrary.
+    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found.
+    calibrated: camera_ids whose focal length the first pass has found. metric: whether lengths are metres; false in a
+    frame of the pictures' own, whose scale is arbitrary.
     """
 
     images: tuple[Image, ...]
@@ -231,6 +232,7 @@ class Block:
     tied: tuple[tuple[str, str], ...] = ()
     similar: tuple[tuple[str, str], ...] = ()
     outside: frozenset[str] = frozenset()
+    calibrated: frozenset[str] = frozenset()
     reduced_gsd_m: float | None = None
     metric: bool = True
 
@@ -257,6 +259,10 @@ class Pair:
     overlap: float
     view_angle_deg: float
     reason: str
+
+    @property
+    def ids(self) -> tuple[str, str]:
+        return self.image_id0, self.image_id1
 
 
 @dataclass(frozen=True, eq=False)

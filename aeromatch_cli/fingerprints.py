@@ -30,8 +30,19 @@ _DEEP_PICTURES = 1
 
 def fingerprint(*parts: Any) -> str:
     """SHA-256 (hex) of the canonical JSON of `parts`; strategies bring their name, settings and version."""
-    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=_plain, allow_nan=True)
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+    return combined(*map(canonical, parts))
+
+
+def canonical(value: Any) -> str:
+    """The text of a part of a fingerprint: canonical JSON."""
+    if type(value) is str and value.isalnum() and value.isascii():
+        return f'"{value}"'  # most parts are fingerprints themselves
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), default=_plain, allow_nan=True)
+
+
+def combined(*texts: str) -> str:
+    """The same as `fingerprint`, from the canonical text of each part."""
+    return hashlib.sha256(f"[{','.join(texts)}]".encode()).hexdigest()
 
 
 # Marks of a field's json_schema_extra that keep its value out of the fingerprint.

@@ -227,13 +227,12 @@ class Workspace:
     def check_links(self) -> None:
         """Raises WorkspaceError where a link leads out of the folder: what is written through it would land there."""
         root = self.root.resolve()
-        for parent, folders, files in os.walk(root):
-            for path in (Path(parent) / name for name in (*folders, *files)):
-                if path.is_symlink() and not path.resolve().is_relative_to(root):
-                    raise WorkspaceError(
-                        f"{path} is a link that leads out of the workspace, to {path.resolve()}: remove it; to keep "
-                        "results on another disk, place the whole workspace there"
-                    )
+        for path in _links_below(root):
+            if not path.resolve().is_relative_to(root):
+                raise WorkspaceError(
+                    f"{path} is a link that leads out of the workspace, to {path.resolve()}: remove it; to keep "
+                    "results on another disk, place the whole workspace there"
+                )
 
     def check_version(self) -> None:
         """Raises WorkspaceError where another format version wrote this workspace."""
@@ -246,6 +245,16 @@ class Workspace:
                 f"workspace {self.root} has format version {found}, this program writes {FORMAT_VERSION}; "
                 "use the version that wrote it, or choose another --workspace"
             )
+
+
+def _links_below(folder: Path) -> Iterator[Path]:
+    """Yield symbolic links at any depth; `Path.walk` and the like ask the disk for each of a hundred thousand files."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_symlink():
+                yield Path(entry.path)
+            elif entry.is_dir():
+                yield from _links_below(Path(entry.path))
 
 
 def opened_workspace(root: Path) -> Workspace:

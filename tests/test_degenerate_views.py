@@ -18,7 +18,7 @@ from aeromatch_cli.files import write_json
 from aeromatch_cli.geometry.cameras import from_colmap
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.stages import simulate
-from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.context import Context, Given
 from aeromatch_cli.strategies.simulators import GroundView
 from aeromatch_cli.workspace import Workspace
 
@@ -75,7 +75,7 @@ def test_an_image_below_all_ground_sees_none() -> None:
 
 
 def context_of(block: Block, root: Path) -> Context:
-    return Context(Settings(), Workspace(root), Executor("serial"), block, (), {}, block)
+    return Context(Settings(), Workspace(root), Executor("serial"), Given(block, {}), block)
 
 
 def test_the_views_and_their_file_say_why(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import output, scores, totals
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.results import stages as results
+from aeromatch_cli.stages.context import Scope
 from aeromatch_cli.workspace import Workspace
 
 PAGE = text_of(ROOT / "docs" / "extending.md")
@@ -138,7 +139,7 @@ def test_the_stage_writes_its_table_where_it_is_not_up_to_date(
         (pair, SimpleNamespace(matches=SimpleNamespace(indices=range(n))))
         for pair, n in zip(pairs, (7, 0), strict=True)
     ]
-    context = SimpleNamespace(workspace=Workspace(tmp_path), pairs=pairs, overwrite=False)
+    context = SimpleNamespace(workspace=Workspace(tmp_path), pairs=pairs, scope=Scope())
     module.with_current_pairs = lambda context: (context, [])
     declared = graph.Stage("connections", "block", module.ConnectionsResult)
     monkeypatch.setattr(graph, "BY_NAME", {**graph.BY_NAME, "connections": declared})

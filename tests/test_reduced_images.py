@@ -15,7 +15,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.stages import extract
-from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.context import Context, Given
 from aeromatch_cli.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -52,9 +52,9 @@ def extracted(root: Path, max_size_px: int) -> Features:
     workspace = Workspace(root / "work")
     workspace.create()
     prints = {"blobs": image_fingerprint(root / "images" / "blobs.png")}
-    context = Context(settings, workspace, Executor("serial"), known, (), prints, {})
+    context = Context(settings, workspace, Executor("serial"), Given(known, prints), known)
     task = extract.make_task(context, image)
-    assert extract.run_task(task).keypoints > 0
+    assert extract.run_task(task).features.keypoints > 0
     return read_features(task.path)
 
 

@@ -15,7 +15,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.stages import simulate
 from aeromatch_cli.stages.block import with_gsd
-from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.context import Context, Given
 from aeromatch_cli.workspace import Workspace
 
 HEIGHTS_M = (60.0, 80.0, 100.0, 120.0, 140.0)  # 0.06 to 0.14 m per stored pixel
@@ -35,7 +35,9 @@ def context_of(root: Path, max_size_px: int, simulator: str = "ground", before_m
     known = with_gsd(block(), before_m, max_size_px)
     ids = [image.image_id for image in known.images]
     pairs = tuple(Pair(a, b, 0.5, 5.0, "overlap") for k, a in enumerate(ids) for b in ids[k + 1 :])
-    return Context(settings, Workspace(root / "work"), Executor("serial"), known, pairs, dict.fromkeys(ids, ""), {})
+    return Context(
+        settings, Workspace(root / "work"), Executor("serial"), Given(known, dict.fromkeys(ids, "")), known, pairs
+    )
 
 
 def view_scales(context: Context) -> list[float]:

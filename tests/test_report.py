@@ -30,7 +30,7 @@ from aeromatch_cli.report.pair_viewer import pair_table
 from aeromatch_cli.report.previews import chosen_previews
 from aeromatch_cli.report.rows import ImageRow, PairRow, stage_rows
 from aeromatch_cli.results.stages import FilterResult, OrientResult, PairsResult, RefineResult
-from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.context import Context, Given
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import Workspace
 
@@ -100,7 +100,7 @@ def context(root: Path, poses: dict[str, Pose], pairs: tuple[Pair, ...]) -> Cont
     settings = Settings.model_validate({"block": {"images": str(root / "images")}})
     workspace = Workspace(root / "work")
     workspace.create()
-    return Context(settings, workspace, Executor("serial"), block(poses), pairs, {}, poses)
+    return Context(settings, workspace, Executor("serial"), Given(block(poses), {}), block(poses), pairs)
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ Poses, cameras and points go to the workspace's orientation folder, for the expo
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +91,7 @@ def _groups(context: Context) -> Sequence[Group]:
 
 
 def _is_current(context: Context, groups: Sequence[Group]) -> bool:
-    made_now = replace(context, overwrite=False)
+    made_now = context.with_scope(overwrite=False)
     return bool(groups) and StageReport("adjust", fingerprint=_fingerprint(context)).is_up_to_date(made_now)
 
 
@@ -142,7 +141,7 @@ def _result(
     control = control_of_block(context, adjusted, groups)
     return AdjustResult(
         **block_figures(adjusted, context.block.images, groups),
-        positions_given=len(context.given.poses),
+        positions_given=len(context.given.block.poses),
         reduced=_reduced(context),
         outside=unregistered_reasons(context, adjusted),
         held_by=_held_by(context),

@@ -137,10 +137,10 @@ def run(context: Context) -> list[StepContext]:
         # All images in the first step: what failed there is told of those, too, that are in no pair.
         ids = match.images_of_rows(own) if step.name == FIRST else match.paired_images(own)
         # Features of the first step are made once, also where everything is made anew.
-        making = own if step.own_features else replace(own, overwrite=False)
+        making = own if step.own_features else own.with_scope(overwrite=False)
         reports = [extract.run_own_first(making, ids), match.run(own), filter.run(own)]
         for report in reports:
-            report.part = own.part
+            report.part = own.scope.part
         done.append(replace(step, reports=tuple(reports)))
     return done
 
@@ -222,7 +222,7 @@ def _further_step(context: Context, recipe: Step, reasons: Mapping[Key, str]) ->
     changed = {"cascade": (), **strategies_of(recipe, context.settings)}
     features_of = recipe.name if recipe.own_features else FIRST
     # A step with the first one's features goes on from its matches.
-    context = replace(context, searched_by=None if recipe.own_features else context.settings.match)
+    context = context.with_scope(searched_by=None if recipe.own_features else context.settings.match)
     return _step(context, recipe.name, features_of, context.settings.model_copy(update=changed), reasons)
 
 
@@ -231,8 +231,7 @@ def _step(context: Context, name: str, features_of: str, settings: Settings, rea
         context,
         settings=settings,
         workspace=context.workspace.step(name, features_of),
-        chosen=frozenset(reasons),
-        part=f"step {name}: ",
+        scope=replace(context.scope, chosen=frozenset(reasons), part=f"step {name}: "),
     )
     return StepContext(name, features_of, own, reasons)
 

@@ -79,7 +79,7 @@ def _contents(
     pairs: Iterable[PairContents],
     adjusted: AdjustedBlock | None,
 ) -> ExportContents:
-    block, given = context.block, context.given.poses
+    block, given = context.block, context.given.block.poses
 
     def geographic(world_m: FloatArray) -> FloatArray:
         places_m = world_m + np.array(block.origin_m)

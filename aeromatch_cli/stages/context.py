@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from aeromatch_cli.store.index import Index
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.workspace import Workspace
 
+V = TypeVar("V")
 # A focal length with a larger standard deviation, as a share of it, is a guess.
 _GUESS = 0.2
 
@@ -42,62 +43,86 @@ class Union:
 
 
 @dataclass(frozen=True, eq=False)
-class Context:
-    """Holds everything that a stage needs to know. It is made once per command by `stages.pairs.prepare`.
+class Given:
+    """Holds what was given of a block, before it was oriented.
 
-    settings: the resolved settings. workspace: the paths of the workspace's files. executor: runs the tasks of stages.
-    index: what is known of the files of the workspace.
-    block: images, cameras, poses and ground in the world frame, oriented once `stages.orient` has run.
-    pairs: the pairs of pairs.csv, in its order.
+    block: images, cameras, poses and ground as they were stated.
     image_fingerprints: image_id -> fingerprint of the image file.
-    given: the block before it was oriented.
     focal_sigmas: camera_id -> standard deviation of its focal length as it was stated, as a share of it.
-    calibrated: camera_ids whose focal length the first pass has found.
     likely_focals: camera_id -> focal length in pixels that EXIF supports, where it contradicts the given one.
     angles: image_id -> attitude as it was given.
     flights: image_id -> name of its flight.
     velocities: image_id -> (3,) velocity of the aircraft in the world frame, m/s, where it is known.
     control: surveyed points.
     remote: name of an image -> where it lies on another machine; empty where the images lie in a folder.
-    chosen: the pairs (image_id0, image_id1) that a step of a cascade works on; None for all.
-    searched_by: the matcher that made the matches which a step of a cascade continues from; None without such a step.
-    union: the fingerprints of features and matches that the steps of a cascade have made together; None without one.
-    part: a prefix to the names of stages where progress is shown.
-    shard: the part of the block that this command works on; None for all.
-    overwrite: whether results that are up to date are made again.
-    known_fingerprints: caches (image_id, needs) -> fingerprint of the image's geometry.
-    known_tasks: caches image_id -> task of the stage extract.
-    known_pairs: caches (kind, image_id0, image_id1) -> fingerprint that matches and verdicts of a pair must carry.
-
-    The caches are filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were
-    made from.
     """
 
-    settings: Settings
-    workspace: Workspace
-    executor: Executor
     block: Block
-    pairs: tuple[Pair, ...]
     image_fingerprints: Mapping[str, str]
-    given: Block
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
-    calibrated: frozenset[str] = frozenset()
     likely_focals: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
     remote: Mapping[str, RemoteFile] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """Says which part of the work a command does.
+
+    shard: the part of the block that it works on; None for all.
+    overwrite: whether results that are up to date are made again.
+    chosen: the pairs (image_id0, image_id1) that a step of a cascade works on; None for all.
+    searched_by: the matcher that made the matches which a step of a cascade continues from; None without such a step.
+    union: the fingerprints of features and matches that the steps of a cascade have made together; None without one.
+    part: a prefix to the names of stages where progress is shown.
+    """
+
+    shard: Shard | None = None
+    overwrite: bool = False
     chosen: frozenset[tuple[str, str]] | None = None
     searched_by: Matcher | None = None
     union: Union | None = None
     part: str = ""
-    shard: Shard | None = None
-    overwrite: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """Holds everything that a stage needs to know. It is made once per command by `stages.pairs.prepare`.
+
+    settings: the resolved settings. workspace: the paths of the workspace's files. executor: runs the tasks of stages.
+    given: what was given of the block.
+    block: images, cameras, poses and ground in the world frame, oriented once `stages.orient` has run.
+    pairs: the pairs of pairs.csv, in its order.
+    scope: the part of the work that is done.
+    index: what is known of the files of the workspace.
+
+    What follows from these is kept in `known`, which is filled on demand; `dataclasses.replace` starts it anew, so that
+    it never outlives what it was made from.
+    """
+
+    settings: Settings
+    workspace: Workspace
+    executor: Executor
+    given: Given
+    block: Block
+    pairs: tuple[Pair, ...] = ()
+    scope: Scope = field(default_factory=Scope)
     index: Index = field(default_factory=Index, repr=False)
-    known_fingerprints: dict[tuple[str, frozenset[str]], str] = field(default_factory=dict, init=False, repr=False)
-    known_tasks: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
-    known_pairs: dict[tuple[str, str, str], str] = field(default_factory=dict, init=False, repr=False)
+    known: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)
+
+    def with_scope(self, **changes: Any) -> Context:
+        """Return the context with another scope. changes: of the fields of `Scope`."""
+        return replace(self, scope=replace(self.scope, **changes))
+
+    def once(self, *key: Any, make: Callable[[], V]) -> V:
+        """Return what follows from the context, made once as long as the context stays. key: names it."""
+        if key not in self.known:
+            self.known[key] = make()
+        value: V = self.known[key]
+        return value
 
     @property
     def store(self) -> BlockStore:
@@ -113,31 +138,33 @@ class Context:
             calibration=adjust.calibration,
             switches=switches,
             rolling_shutter=adjust.rolling_shutter,
-            poses=self.given.poses,
-            focal_sigmas=self.focal_sigmas,
-            angles=self.angles,
-            cameras={camera_id: self._stated_camera(camera_id) for camera_id in self.given.cameras},
-            flights=self.flights,
-            velocities=self.velocities,
-            control=self.control,
+            poses=self.given.block.poses,
+            focal_sigmas=self.given.focal_sigmas,
+            angles=self.given.angles,
+            cameras={camera_id: self._stated_camera(camera_id) for camera_id in self.given.block.cameras},
+            flights=self.given.flights,
+            velocities=self.given.velocities,
+            control=self.given.control,
         )
 
     def _stated_camera(self, camera_id: str) -> Camera:
         """A camera as given; where EXIF contradicts it, with that focal length which the pictures are nearer to."""
-        stated = self.given.cameras[camera_id]
-        if camera_id not in self.likely_focals or camera_id not in self.block.cameras:
+        stated = self.given.block.cameras[camera_id]
+        if camera_id not in self.given.likely_focals or camera_id not in self.block.cameras:
             return stated
         found_px = focal_px(self.block.cameras[camera_id])
-        nearest_px = min(focal_px(stated), self.likely_focals[camera_id], key=lambda px: abs(np.log(px / found_px)))
+        nearest_px = min(
+            focal_px(stated), self.given.likely_focals[camera_id], key=lambda px: abs(np.log(px / found_px))
+        )
         return with_focal_length(stated, nearest_px)
 
     @property
     def guessed_cameras(self) -> frozenset[str]:
         """Cameras whose focal length is no more than a guess."""
-        return frozenset(i for i, sigma in self.focal_sigmas.items() if sigma >= _GUESS) - self.calibrated
+        return frozenset(i for i, sigma in self.given.focal_sigmas.items() if sigma >= _GUESS) - self.block.calibrated
 
     def owns(self, item_id: str) -> bool:
-        return self.shard is None or self.shard.owns(item_id)
+        return self.scope.shard is None or self.scope.shard.owns(item_id)
 
     def images(self) -> list[Image]:
         """The images of this shard."""
@@ -146,15 +173,16 @@ class Context:
     def rows(self) -> dict[str, list[Pair]]:
         """Pairs of this shard and step by image_id0, in order."""
         rows: dict[str, list[Pair]] = {}
+        chosen = self.scope.chosen
         for pair in self.pairs:
-            wanted = self.chosen is None or (pair.image_id0, pair.image_id1) in self.chosen
+            wanted = chosen is None or (pair.image_id0, pair.image_id1) in chosen
             if wanted and self.owns(pair.image_id0):
                 rows.setdefault(pair.image_id0, []).append(pair)
         return rows
 
     def picture(self, image: Image) -> Path | RemoteFile:
         """Return where an image lies, here or elsewhere."""
-        return self.remote.get(image.name) or Path(self.settings.block.images) / image.name
+        return self.given.remote.get(image.name) or Path(self.settings.block.images) / image.name
 
     def image_path(self, image: Image) -> Path:
         """Return the file of an image on this machine. Raises ItemError where it cannot be fetched."""
@@ -231,19 +259,9 @@ class Context:
             found.setdefault(pair.image_id1, []).append((pair.image_id0, pair.overlap))
         return {image_id: sorted(others) for image_id, others in found.items()}
 
-    def once_per_pair(self, what: str, pair: Pair, make: Callable[[], str]) -> str:
-        """A fingerprint of a pair, made once per command."""
-        key = what, pair.image_id0, pair.image_id1
-        if key not in self.known_pairs:
-            self.known_pairs[key] = make()
-        return self.known_pairs[key]
-
     def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         """Return the fingerprint of what strategies with these `needs` read of one image's geometry."""
-        key = image_id, needs
-        if key not in self.known_fingerprints:
-            self.known_fingerprints[key] = self._geometry_fingerprint(image_id, needs)
-        return self.known_fingerprints[key]
+        return self.once("geometry", image_id, needs, make=lambda: self._geometry_fingerprint(image_id, needs))
 
     def _geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         pose = self.pose(image_id)

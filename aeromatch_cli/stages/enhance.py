@@ -79,7 +79,7 @@ def source_of(context: Context, image: Image) -> Source:
     parts = [
         PIPELINE_VERSION,
         library_version("opencv-python-headless"),
-        context.image_fingerprints[image.image_id],
+        context.given.image_fingerprints[image.image_id],
         mask_fingerprint(mask) if mask else "",
         scale,
         context.geometry_fingerprint(image.image_id, frozenset({"camera", "pose"})) if sky else "",
@@ -91,7 +91,7 @@ def source_of(context: Context, image: Image) -> Source:
         sky_rotation=pose.world_rotation if sky and pose else None,
         scale=scale,
         fingerprint=fingerprint(*parts),
-        taken=context.image_fingerprints[image.image_id],
+        taken=context.given.image_fingerprints[image.image_id],
     )
 
 
@@ -170,7 +170,9 @@ def run(context: Context) -> StageReport:
     """Write enhanced/<id>.png for every image of the shard that is not up to date; none for images left as taken."""
     report = StageReport("enhance")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [task for task in tasks if not task.as_taken and (context.overwrite or not is_done(context.store, task))]
+    todo = [
+        task for task in tasks if not task.as_taken and (context.scope.overwrite or not is_done(context.store, task))
+    ]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
     for task in tasks:
         if task.as_taken:
@@ -182,7 +184,7 @@ def run(context: Context) -> StageReport:
         remark="" if context.settings.enhance.changes else nothing,
     )
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
-    return report.write(context.workspace, context.shard)
+    return report.write(context.workspace, context.scope.shard)
 
 
 def skipped_images(tasks: Iterable[EnhanceTask]) -> int | None:

@@ -35,7 +35,7 @@ def run(context: Context) -> StageReport:
     report = StageReport("export")
     context, outdated = with_current_pairs(context)
     adjusted = final_block(context)
-    given = sorted(context.given.poses.items()), sorted(context.guessed_cameras)
+    given = sorted(context.given.block.poses.items()), sorted(context.guessed_cameras)
     wanted = fingerprint(context.settings.export, inputs_fingerprint(context, "export"), given, adjusted is None)
     report.items, report.fingerprint = len(context.settings.export), wanted
     folders = [context.workspace.export(exporter.name) for exporter in context.settings.export]

@@ -91,10 +91,7 @@ def in_stored_frame(features: Features, scale: float) -> Features:
 
 def task_of(context: Context, image_id: str) -> ExtractTask:
     """Return the task of one image, made once per command."""
-    if image_id not in context.known_tasks:
-        context.known_tasks[image_id] = make_task(context, context.image_by_id[image_id])
-    task: ExtractTask = context.known_tasks[image_id]
-    return task
+    return context.once("extract", image_id, make=lambda: make_task(context, context.image_by_id[image_id]))
 
 
 def run(context: Context, image_ids: Iterable[str] | None = None, before: StageReport | None = None) -> StageReport:
@@ -105,7 +102,7 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     report = before or StageReport("extract")
     chosen = [image.image_id for image in context.images()] if image_ids is None else sorted(set(image_ids))
     tasks = [task_of(context, image_id) for image_id in chosen]
-    todo = [task for task in tasks if context.overwrite or not _is_done(context.store, task)]
+    todo = [task for task in tasks if context.scope.overwrite or not _is_done(context.store, task)]
     report.items += len(tasks)
     report.skipped += len(tasks) - len(todo)
     network = any(task.extractor.network for task in todo)
@@ -116,7 +113,7 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     if made:
         report.result = _result(made, tasks, report.result)
     report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
-    return report.write(context.workspace, context.shard)
+    return report.write(context.workspace, context.scope.shard)
 
 
 def _result(made: Sequence[Extracted], tasks: Sequence[ExtractTask], before: StageResult | None) -> ExtractResult:
@@ -137,7 +134,7 @@ def run_own_first(context: Context, image_ids: Iterable[str]) -> StageReport:
     ids = set(image_ids)
     own = {image_id for image_id in ids if context.owns(image_id)}
     report = run(context, own)
-    return run(replace(context, overwrite=False), ids - own, report) if own < ids else report
+    return run(context.with_scope(overwrite=False), ids - own, report) if own < ids else report
 
 
 def _is_done(store: BlockStore, task: ExtractTask) -> bool:
@@ -157,6 +154,6 @@ def current(context: Context, image_ids: Iterable[str]) -> set[str]:
 
 def wanted(context: Context, image_id: str) -> str:
     """Return the fingerprint that the features of an image must carry."""
-    if context.union is not None:
-        return context.union.features.get(image_id, "")
+    if context.scope.union is not None:
+        return context.scope.union.features.get(image_id, "")
     return task_of(context, image_id).fingerprint

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import Candidates, FloatArray, Matches, Pair
 from aeromatch_cli.files import read_json, write_atomically
-from aeromatch_cli.fingerprints import fingerprint, stable_hash
+from aeromatch_cli.fingerprints import canonical, combined, fingerprint, stable_hash
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import (
     MatchEntry,
@@ -64,15 +64,21 @@ def pair_seed(context: Context, pair: Pair) -> int:
 def pair_fingerprint(context: Context, pair: Pair) -> str:
     """Return the fingerprint that the verdict on a pair must carry: of the chain, the matches, the geometry that the
     chain reads, and the seed."""
-    return context.once_per_pair("filter", pair, lambda: _pair_fingerprint(context, pair))
+    return context.once("filter", *pair.ids, make=lambda: _pair_fingerprint(context, pair))
 
 
 def _pair_fingerprint(context: Context, pair: Pair) -> str:
+    how, needs = context.once("filter", make=lambda: _how(context))
+    sides = [context.geometry_fingerprint(i, needs) for i in pair.ids]
+    own = match.pair_fingerprint(context, pair), sides, pair_seed(context, pair)
+    return combined(*how, *map(canonical, own))
+
+
+def _how(context: Context) -> tuple[tuple[str, ...], frozenset[str]]:
+    """Return what the verdicts on all pairs depend on, as canonical text, and what the chain needs of the geometry."""
     chain = context.settings.filter
     needs = frozenset[str]().union(*(strategy.needs for strategy in chain))
-    sides = [context.geometry_fingerprint(i, needs) for i in (pair.image_id0, pair.image_id1)]
-    matches = match.pair_fingerprint(context, pair)
-    return fingerprint(CHAIN_VERSION, chain, library_version("poselib"), matches, sides, pair_seed(context, pair))
+    return (canonical(CHAIN_VERSION), canonical(chain), canonical(library_version("poselib"))), needs
 
 
 def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
@@ -94,7 +100,9 @@ def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
                 row.append(PairTask(context.geometry(pair), own, on_file.features, pair_seed(context, pair)))
             else:
                 missing.append(pair)
-        tasks.append(FilterTask(image_id0, tuple(row), context.settings.filter, context.workspace, context.overwrite))
+        tasks.append(
+            FilterTask(image_id0, tuple(row), context.settings.filter, context.workspace, context.scope.overwrite)
+        )
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0)), missing
 
 
@@ -144,13 +152,13 @@ def run(context: Context) -> StageReport:
     ids = sorted(image.image_id for image in context.block.images)
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs), ids)
     report.result = _result_on_file(context, report) or connection(context)
-    return report.write(context.workspace, context.shard)
+    return report.write(context.workspace, context.scope.shard)
 
 
 def _result_on_file(context: Context, report: StageReport) -> FilterResult | None:
     """Return the result of the last run, where nothing was made now and the verdicts are the same ones; else None."""
-    last = context.workspace.stage_report(report.stage, context.shard.label if context.shard else "")
-    if report.done or report.failures or context.overwrite or not last.is_file():
+    last = context.workspace.stage_report(report.stage, context.scope.shard.label if context.scope.shard else "")
+    if report.done or report.failures or context.scope.overwrite or not last.is_file():
         return None
     found = read_json(last)
     same = found.get("fingerprint") == report.fingerprint and not found["failed"]

@@ -107,8 +107,7 @@ def prepared(context: Context, recipe: FirstPass, part: str = "first pass") -> C
         workspace=context.workspace.first_pass,
         block=block,
         pairs=(),
-        shard=None,
-        part=f"{part}: ",
+        scope=replace(context.scope, shard=None, part=f"{part}: "),
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import write_atomically
-from aeromatch_cli.fingerprints import fingerprint
+from aeromatch_cli.fingerprints import canonical, combined, fingerprint
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row, write_match_row
 from aeromatch_cli.images.source import Source
@@ -52,19 +52,22 @@ def matcher_of(context: Context, pair: Pair) -> Matcher:
 def pair_fingerprint(context: Context, pair: Pair) -> str:
     """Return the fingerprint that the matches of a pair must carry: of the matcher, both images' features, and their
     geometry."""
-    if context.union is not None:
-        return context.union.matches.get((pair.image_id0, pair.image_id1), "")
-    return context.once_per_pair("match", pair, lambda: _pair_fingerprint(context, pair))
+    if context.scope.union is not None:
+        return context.scope.union.matches.get((pair.image_id0, pair.image_id1), "")
+    return context.once("match", *pair.ids, make=lambda: _pair_fingerprint(context, pair))
 
 
 def _pair_fingerprint(context: Context, pair: Pair) -> str:
-    matcher = matcher_of(context, pair)
-    sides = [
-        (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads()))
-        for i in (pair.image_id0, pair.image_id1)
-    ]
+    matcher, ids = matcher_of(context, pair), pair.ids
     overlap = str(pair.overlap) if matcher.reads_pixels else ""  # where it is small, poses are not doubted
-    return fingerprint(matcher, context.searched_by, library_version("poselib"), sides, overlap)
+    how = context.once("match", matcher is context.settings.match, make=lambda: _how(context, matcher))
+    sides = [(extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads())) for i in ids]
+    return combined(*how, canonical(sides), canonical(overlap))
+
+
+def _how(context: Context, matcher: Matcher) -> tuple[str, ...]:
+    """Return what the matches of all pairs of one matcher depend on, as canonical text."""
+    return canonical(matcher), canonical(context.scope.searched_by), canonical(library_version("poselib"))
 
 
 def paired_images(context: Context) -> set[str]:
@@ -91,7 +94,7 @@ def make_tasks(context: Context) -> list[MatchTask]:
             ids = (image_id0, *(pair.image_id1 for pair in row)) if context.settings.match.reads_pixels else ()
             sources = {image_id: extract.task_of(context, image_id).views.enhance.source for image_id in ids}
             matchers = {pair.image_id1: matcher_of(context, pair) for pair in usable}
-            task = MatchTask(image_id0, row, matchers, context.workspace, context.overwrite, sources)
+            task = MatchTask(image_id0, row, matchers, context.workspace, context.scope.overwrite, sources)
             tasks.append(task)
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
 
@@ -171,4 +174,4 @@ def run(context: Context) -> StageReport:
     if report.done:
         report.result = MatchResult(matches=sum(result.found for result in results))
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
-    return report.write(context.workspace, context.shard)
+    return report.write(context.workspace, context.scope.shard)

@@ -199,7 +199,7 @@ def evidence_of(
     prepared = first_pass.prepared(context, recipe, "first pass on given poses" if look else "first pass")
     first, failed = first_pass.run(prepared, recipe, by_position=by_position)
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
-    return first, FirstPassMatches(context.block, pairs, thresholds_px(first), context.given.cameras, failed)
+    return first, FirstPassMatches(context.block, pairs, thresholds_px(first), context.given.block.cameras, failed)
 
 
 def thresholds_px(first: Context) -> dict[str, float]:

@@ -95,7 +95,7 @@ def run(
         context = replace(
             context,
             block=replace(context.block, crs="local", origin_m=(0.0, 0.0, 0.0), metric=False),
-            given=replace(context.given, poses={}),
+            given=replace(context.given, block=replace(context.given.block, poses={})),
         )
     block = replace(
         context.block,
@@ -106,11 +106,12 @@ def run(
         tied=tuple((id0, id1) for id0, id1 in record["tied"]),
         similar=tuple((id0, id1) for id0, id1 in record["similar"]),
         outside=frozenset(found.outside),
+        calibrated=frozenset(found.calibrated),
     )
     report.failures = _failed_images(context, record["failed"])
     if found.stopped:
         report.failures.append((_MAPPING, found.stopped))
-    context = replace(context, block=block, calibrated=frozenset(found.calibrated))
+    context = replace(context, block=block)
     return context, report if dry else report.write(context.workspace)
 
 
@@ -125,7 +126,7 @@ def _failed_images(context: Context, failed: Sequence[str]) -> list[tuple[str, s
 
 def groups(context: Context) -> list[Group]:
     """Return images that the orientation on file holds, the largest group first; none without an orientation."""
-    record = _on_file(replace(context, overwrite=False))
+    record = _on_file(context.with_scope(overwrite=False))
     return [Group(str(one["kind"]), tuple(one["images"])) for one in record.get("groups", ()) if one["images"]]
 
 
@@ -159,7 +160,7 @@ def _solution(
         mapped, tried = best_mapped(context, recipe, first, evidence)
         models, first, evidence, stopped = mapped.models, mapped.first, mapped.evidence, mapped.stopped
         exchanged = exchanged_columns(block, models[0]) if models and mapped.contradicted else ""
-        solution = from_models(evidence, models, _before(context, kept, before), context.angles, exchanged)
+        solution = from_models(evidence, models, _before(context, kept, before), context.given.angles, exchanged)
         if not models and not stopped:
             solution.result.remarks.append(unoriented_remark(evidence))
         if not recipe.replaces:
@@ -191,7 +192,7 @@ def _with_better_cameras(
     block = evidence.block
     camera_ids = {image.image_id: image.camera_id for image in block.images}
     seen = evidence.pairs, block.poses, block.cameras, camera_ids, evidence.thresholds_px
-    cameras = {**block.cameras, **better_cameras(*seen, context.likely_focals)}
+    cameras = {**block.cameras, **better_cameras(*seen, context.given.likely_focals)}
     return (
         replace(context, block=replace(context.block, cameras=cameras)),
         replace(first, block=replace(first.block, cameras=cameras)),
@@ -219,10 +220,10 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
         if pose is not None:
             place = pose.center_m, pose.world_rotation, pose.sigma_position_m, pose.sigma_angle_deg
         mask = mask_path(settings.block.masks, image.name)
-        taken = context.image_fingerprints[image.image_id], image.time, mask_fingerprint(mask) if mask else ""
+        taken = context.given.image_fingerprints[image.image_id], image.time, mask_fingerprint(mask) if mask else ""
         images[image.image_id] = fingerprint(
-            taken, image.camera_id, block.camera(image), place, context.angles.get(image.image_id),
-            context.likely_focals.get(image.camera_id),
+            taken, image.camera_id, block.camera(image), place, context.given.angles.get(image.image_id),
+            context.given.likely_focals.get(image.camera_id),
         )  # fmt: skip
     how: list[Any] = [settings.orient, settings.block.max_size_px, _LARGE_BLOCK_VERSION]
     if settings.similar is not None:

@@ -18,7 +18,7 @@ from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, 
 from aeromatch_cli.results.stages import OrientResult, PairsResult
 from aeromatch_cli.stages import orient, picture_quality
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
-from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.context import Context, Given, Scope
 from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network
 from aeromatch_cli.stages.messages import orientation_lines
 from aeromatch_cli.stages.shard import Shard
@@ -178,20 +178,20 @@ def _context(
         settings=settings,
         workspace=workspace,
         executor=executor,
-        index=index,
+        given=Given(
+            block=found.block,
+            image_fingerprints=found.image_fingerprints,
+            focal_sigmas=found.focal_sigmas,
+            likely_focals=found.likely_focals,
+            angles=found.angles,
+            flights=found.flights,
+            velocities=found.velocities,
+            control=found.control,
+            remote=found.remote,
+        ),
         block=found.block,
-        pairs=(),
-        image_fingerprints=found.image_fingerprints,
-        given=found.block,
-        focal_sigmas=found.focal_sigmas,
-        likely_focals=found.likely_focals,
-        angles=found.angles,
-        flights=found.flights,
-        velocities=found.velocities,
-        remote=found.remote,
-        control=found.control,
-        shard=shard,
-        overwrite=overwrite,
+        scope=Scope(shard=shard, overwrite=overwrite),
+        index=index,
     )
 
 
@@ -240,7 +240,7 @@ def _write(context: Context, pairs_csv: str, quality: Mapping[str, PictureQualit
     """Write settings and tables of the block; return the tables."""
     workspace, block = context.workspace, context.block
     texts = {
-        workspace.images: images_text(block.images, context.image_fingerprints, quality),
+        workspace.images: images_text(block.images, context.given.image_fingerprints, quality),
         workspace.cameras: cameras_text(block.cameras),
         workspace.poses: poses_text(block.poses),
         workspace.pairs: pairs_csv,
@@ -248,5 +248,5 @@ def _write(context: Context, pairs_csv: str, quality: Mapping[str, PictureQualit
     write_text(workspace.config, dump(context.settings))
     for path, text in texts.items():
         write_text(path, text)
-    write_json(workspace.block, block_record(block, context.given, context.settings))
+    write_json(workspace.block, block_record(block, context.given.block, context.settings))
     return [workspace.block, *texts]

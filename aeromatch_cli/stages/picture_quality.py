@@ -25,12 +25,12 @@ def measured(context: Context, *, dry: bool = False) -> dict[str, PictureQuality
         before = read_picture_quality(context.workspace.images) if context.workspace.images.is_file() else {}
     except BrokenFileError:
         before = {}
-    prints = context.image_fingerprints
+    prints = context.given.image_fingerprints
     found = {
         i.image_id: before[key] for i in context.block.images if (key := (i.image_id, prints[i.image_id])) in before
     }
     rest = [image for image in context.block.images if image.image_id not in found]
-    if rest and context.shard is None and not dry:
+    if rest and context.scope.shard is None and not dry:
         pictures = [context.picture(image) for image in rest]
         for image, outcome in zip(rest, context.executor.run(_measure, pictures, "image quality"), strict=True):
             if outcome.value is not None:

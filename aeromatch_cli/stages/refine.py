@@ -111,7 +111,7 @@ def _make_room(context: Context) -> None:
     workspace = context.workspace
     folder, kept = workspace.refined("").parent, workspace.measured("").parent
     forget(context, "refine")
-    if context.overwrite:
+    if context.scope.overwrite:
         _remove(folder)
     with translated_os_errors(kept):
         kept.mkdir(parents=True, exist_ok=True)
@@ -220,7 +220,7 @@ def _measured(context: Context, table: _Table, recipe: LeastSquares, report: Sta
         new = [image_id for image_id in needed[number] if image_id not in cut]
         cuts = [CutTask(table.sources[i], table.places_px[i], patches_of(folder, i)) for i in new]
         part = f"{number + 1} of {len(batches)} parts: " if len(batches) > 1 else ""
-        context = replace(context, part=part)
+        context = context.with_scope(part=part)
         run_stage(context, report, cut_patches, cuts, new)
         cut.update(new)
         tasks = [_task(context, table, recipe, image_id, by[image_id]).with_patches() for image_id in batch]

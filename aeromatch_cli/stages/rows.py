@@ -130,13 +130,13 @@ def run_rows(
     work: makes a row. on_file: gives what is known of a row by its image_id0. learn: is told what it holds now.
     network: whether the tasks run one.
     """
-    todo = []
+    todo, anew = [], context.scope.overwrite
     for task in tasks:
         known = {image_id1: one.fingerprint for image_id1, one in on_file(task.image_id0).items()}
         wanted = {pair.image_id1: pair.fingerprint for pair in task.pairs}
         report.items += len(wanted)
-        report.skipped += 0 if context.overwrite else sum(known.get(i) == made_of for i, made_of in wanted.items())
-        if context.overwrite or known != wanted:
+        report.skipped += 0 if anew else sum(known.get(i) == made_of for i, made_of in wanted.items())
+        if anew or known != wanted:
             todo.append(task)
     names, sizes = [task.image_id0 for task in todo], [len(task.pairs) for task in todo]
     results = run_stage(context, report, work, todo, names, sizes, network=network)

@@ -7,7 +7,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from aeromatch_cli import graph, report
@@ -210,7 +209,7 @@ def _attempt(
         if command != "match":
             reports += _stages_of(command, context)
     elif command == "match":
-        features = extract.run(replace(context, overwrite=False), match.images_of_rows(context))
+        features = extract.run(context.with_scope(overwrite=False), match.images_of_rows(context))
         reports += [features, match.run(context)]
     elif command not in ("orient", "pairs"):
         reports += _stages_of(command, context)
@@ -224,7 +223,7 @@ def _attempt(
     old_page = command in JUDGED and report.is_of_earlier_results(context.workspace)
     return command_result(
         command, context.settings, context.workspace, names, reports, failures, said,
-        part=context.shard is not None, old_page=old_page,
+        part=context.scope.shard is not None, old_page=old_page,
     )  # fmt: skip
 
 
@@ -237,14 +236,14 @@ def _there(settings: Settings) -> bool:
 def _stages_of(command: str, context: Context) -> list[StageReport]:
     """Bring the stages of a command up to date; where results are to be made anew, only its own stage is, and of
     `adjust` what belongs to it."""
-    kept = replace(context, overwrite=False) if command == "export" else context
+    kept = context.with_scope(overwrite=False) if command == "export" else context
     return [FUNCTIONS[name](context if name == command else kept) for name in graph.COMMANDS[command]]
 
 
 def _cascaded(context: Context) -> tuple[Context, list[StageReport]]:
     """Run all steps of a cascade and, unless it is a shard, merge what they have found."""
     steps = cascade.run(context)
-    if context.shard is not None:
+    if context.scope.shard is not None:
         return context, [report for step in steps for report in step.reports]
     joined = union.joined_context(context, steps)
     return joined, union.run(joined, steps)
@@ -258,7 +257,7 @@ def _joined(context: Context) -> Context:
 def _run_all(context: Context) -> list[StageReport]:
     """extract, match, filter; then adjust, consistency, export and report."""
     context, reports = _to_filter(context)
-    if context.shard is None:
+    if context.scope.shard is None:
         judged = reports[-1].result
         if not isinstance(judged, FilterResult) or not judged.verified_matches:
             report.run(context)  # in any case: nothing else says why
@@ -295,7 +294,7 @@ def _page(context: Context) -> StageReport:
 def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:
     if context.settings.cascade:
         context, reports = _cascaded(context)
-        return context, reports if context.shard is not None else [*reports, filter.run(context)]
+        return context, reports if context.scope.shard is not None else [*reports, filter.run(context)]
     features = extract.run_own_first(context, match.images_of_rows(context))
     return context, [features, match.run(context), filter.run(context)]
 

@@ -181,13 +181,13 @@ def run(context: Context) -> StageReport:
     """Write simulated/<id>/ for every image of the shard that is not up to date."""
     report = StageReport("simulate")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [task for task in tasks if context.overwrite or not is_done(context.store, task)]
+    todo = [task for task in tasks if context.scope.overwrite or not is_done(context.store, task)]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
     costs = run_stage(context, report, _run_task, todo, [task.enhance.image_id for task in todo])
     if costs:
         report.result = views_result(costs)
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
-    return report.write(context.workspace, context.shard)
+    return report.write(context.workspace, context.scope.shard)
 
 
 def is_done(store: BlockStore, task: SimulateTask) -> bool:

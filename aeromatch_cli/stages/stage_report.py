@@ -109,7 +109,7 @@ def whole_record(context: Context, stage: str) -> dict[str, Any]:
     written; else nothing, and a word says which is not. Nothing, too, where all is made anew."""
     workspace = context.workspace
     path = workspace.stage_report(stage)
-    if context.overwrite or not path.is_file():
+    if context.scope.overwrite or not path.is_file():
         return {}
     record = read_json(path)
     changed = changed_files(workspace.root, record.get("files", {}))
@@ -227,7 +227,7 @@ def run_stage(
 
     sizes: how many items each task counts while it is shown how far the stage is. network: whether tasks run one.
     """
-    label = context.part + report.stage
+    label = context.scope.part + report.stage
     outcomes: list[Outcome[V]] = context.executor.run(function, tasks, label, sizes, network=network) if tasks else []
     values = []
     for name, outcome in zip(names, outcomes, strict=True):

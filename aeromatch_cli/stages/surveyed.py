@@ -38,7 +38,7 @@ def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[
         return []
     east_m, north_m, up_m = offset_m
     across_m = float(np.hypot(east_m, north_m))
-    sigmas_m = [pose.sigma_position_m for pose in context.given.poses.values()]
+    sigmas_m = [pose.sigma_position_m for pose in context.given.block.poses.values()]
     sigma_m = float(np.median(sigmas_m)) if sigmas_m else 0.0
     limit_m = max(_FAR_CONTROL_M, _FAR_CONTROL_SIGMAS * sigma_m)
     if across_m > limit_m:
@@ -56,11 +56,11 @@ def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[
 
 def control_of_block(context: Context, adjusted: AdjustedBlock, groups: Sequence[GroupResult]) -> Control | None:
     """The block beside surveyed points, without those that the adjustment has found wrong or exchanged."""
-    if not context.control:
+    if not context.given.control:
         return None
     found = [group.control for group in groups if group.control is not None]
     left_out = {name for one in found for name in (*one.wrong, *one.exchanged)}
-    return _control_figures(context, adjusted, [point for point in context.control if point.name not in left_out])
+    return _control_figures(context, adjusted, [point for point in context.given.control if point.name not in left_out])
 
 
 def _control_figures(context: Context, adjusted: AdjustedBlock, points: Sequence[ControlPoint]) -> Control:
@@ -76,7 +76,7 @@ def counted_from_below(context: Context, adjusted: AdjustedBlock, control: Contr
     images = context.image_by_id
     turned = [
         replace(point, pixels={i: np.array([x, images[i].height_px - 1.0 - y]) for i, (x, y) in point.pixels.items()})
-        for point in context.control
+        for point in context.given.control
     ]
     as_given_px, turned_px = (
         control.reprojection_error_px,

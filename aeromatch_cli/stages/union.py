@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,7 @@ def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
             judged = None if verdict is None else verdict.fingerprint
             found.append((step.name, match.pair_fingerprint(step.context, pair), judged))
         matches[key] = fingerprint(VERSION, found, features[key[0]], features[key[1]])
-    return replace(context, union=Union(features, matches))
+    return context.with_scope(union=Union(features, matches))
 
 
 def _usable(steps: Sequence[StepContext]) -> list[tuple[StepContext, set[str]]]:
@@ -105,12 +105,12 @@ def _matched(steps: Sequence[StepContext], pair: Pair) -> list[StepContext]:
 
 def run(context: Context, steps: Sequence[StepContext]) -> list[StageReport]:
     """Write features and matches of the context's union, and steps.csv; the reports of extract and match."""
-    assert context.union is not None
+    assert context.scope.union is not None
     return [_join_keypoints(context, steps), _join_matches(context, steps)]
 
 
 def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageReport:
-    assert context.union is not None
+    assert context.scope.union is not None
     report = StageReport("extract", items=len(context.block.images))
     _count_seconds(report, steps, ["extract"])
     report.failures = _failures(steps, "extract")
@@ -120,8 +120,8 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
         image_id = image.image_id
         own = [step for step, ready in usable if image_id in ready]
         joined += bool(own)
-        wanted = context.union.features[image_id]
-        if own and (context.overwrite or context.store.features_fingerprint(image_id) != wanted):
+        wanted = context.scope.union.features[image_id]
+        if own and (context.scope.overwrite or context.store.features_fingerprint(image_id) != wanted):
             paths = tuple((step.name, step.context.workspace.features(image_id)) for step in own)
             tasks.append(KeypointsTask(image_id, paths, context.workspace, wanted))
     for image_id, known in run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks]):
@@ -133,7 +133,7 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
         images_by_step={step.name: len(step.images) for step in steps if step.own_features},
         images_without_keypoints=0 if found is None else found.images_without_keypoints,
     )
-    report.fingerprint = fingerprint(sorted(context.union.features.values()))
+    report.fingerprint = fingerprint(sorted(context.scope.union.features.values()))
     return report.write(context.workspace)
 
 
@@ -213,7 +213,7 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
 
 def _join_tasks(context: Context, steps: Sequence[StepContext]) -> list[JoinTask]:
     """Return one task per row that has a pair with matches."""
-    assert context.union is not None
+    assert context.scope.union is not None
     tasks, ready = [], extract.current(context, {image.image_id for image in context.block.images})
     for image_id0, pairs in context.rows().items():
         wanted, own = [], {}
@@ -222,8 +222,8 @@ def _join_tasks(context: Context, steps: Sequence[StepContext]) -> list[JoinTask
             # Of several steps with the same features the last one's matches count.
             known = {step.features_of: step.context.workspace for step in _matched(steps, pair)}
             if known and set(key) <= ready:
-                features = context.union.features[key[0]], context.union.features[key[1]]
-                wanted.append(PairTask(context.geometry(pair), context.union.matches[key], features))
+                features = context.scope.union.features[key[0]], context.scope.union.features[key[1]]
+                wanted.append(PairTask(context.geometry(pair), context.scope.union.matches[key], features))
                 own[key[1]] = tuple(known.items())
         if wanted:
             tasks.append(JoinTask(image_id0, tuple(wanted), own, context.workspace))

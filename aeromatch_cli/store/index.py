@@ -40,6 +40,7 @@ class Index:
 
     def __init__(self, path: Path | None = None, *, read_only: bool = False) -> None:
         self._path, self._read_only = path, read_only
+        self._folder = "" if path is None else f"{path.parent}{os.sep}"
         self._found: dict[tuple[str, str], tuple[str, Any]] = {}
         self._new: dict[tuple[str, str], Row] = {}
         self._reader: sqlite3.Connection | None = None
@@ -127,9 +128,8 @@ class Index:
 
     def _name(self, path: Path) -> str:
         """The name of a file below the folder of the index, so that a workspace may be moved; else its whole path."""
-        if self._path is not None and path.is_relative_to(self._path.parent):
-            path = path.relative_to(self._path.parent)
-        return os.fsencode(path).decode("utf-8", "backslashreplace")  # SQLite takes no bytes that are no text
+        name = os.fspath(path).removeprefix(self._folder)
+        return os.fsencode(name).decode("utf-8", "backslashreplace")  # SQLite takes no bytes that are no text
 
     def _close(self) -> None:
         if self._reader is not None:
@@ -143,7 +143,7 @@ class Index:
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy in another process knows nothing and writes nothing."""
-        return {"_path": None, "_read_only": True, "_found": {}, "_new": {}, "_reader": None}
+        return {"_path": None, "_folder": "", "_read_only": True, "_found": {}, "_new": {}, "_reader": None}
 
 
 @contextlib.contextmanager
