@@ -18,7 +18,7 @@ from aeromatch_cli.evaluate.opening import BlockTruth
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
 from aeromatch_cli.fingerprints import file_digest
-from aeromatch_cli.formats.refined import read_final_keypoints
+from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.recent import recent

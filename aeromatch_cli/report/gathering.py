@@ -23,8 +23,7 @@ from aeromatch_cli.data import FloatArray, Image, Pair
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json
-from aeromatch_cli.formats.features import read_keypoints
-from aeromatch_cli.formats.refined import checked_final_keypoints
+from aeromatch_cli.formats.features import checked_final_keypoints, read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.geometry.coverage import cells_of

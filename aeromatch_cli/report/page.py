@@ -18,7 +18,7 @@ from aeromatch_cli.config import dump
 from aeromatch_cli.data import AdjustedBlock, FloatArray
 from aeromatch_cli.files import write_record, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
-from aeromatch_cli.formats.refined import read_final_keypoints
+from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.report.adjustment import (
     PRINCIPAL_POINT,

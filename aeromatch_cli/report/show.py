@@ -20,8 +20,8 @@ from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.archives import ARCHIVE_FAULTS
+from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.formats.reading import readable
-from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
 from aeromatch_cli.geometry.cameras import corner_params

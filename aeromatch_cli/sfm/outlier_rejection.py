@@ -17,8 +17,7 @@ from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, Int
 from aeromatch_cli.geometry.cameras import focal_px, world_rays
 from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.geometry.epipolar import ray_depths
-from aeromatch_cli.sfm.connectivity import probable_enough
-from aeromatch_cli.sfm.probability import MatchEvidence, off_neighbours_px, probabilities, usual_off_px
+from aeromatch_cli.sfm.probability import MatchEvidence, off_neighbours_px, probabilities, probable_enough, usual_off_px
 
 # Rays that meet at a smaller angle do not tell whether they meet in front of the cameras.
 _LEAST_ANGLE_DEG = 0.5

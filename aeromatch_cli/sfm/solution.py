@@ -25,10 +25,9 @@ from aeromatch_cli.sfm.epipolar_agreement import (
 )
 from aeromatch_cli.sfm.mapping import Group, Model
 from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES, SLACK
-from aeromatch_cli.sfm.pair_registration import tied_by_pairs
+from aeromatch_cli.sfm.pair_registration import predicted, tied_by_pairs
 from aeromatch_cli.sfm.pose_prior_check import consistent_images
 from aeromatch_cli.sfm.resection import resected
-from aeromatch_cli.sfm.strip_attitudes import predicted
 
 # Given poses stay where they explain the matches of this share of the images: single others are corrected.
 _MOST = 0.6

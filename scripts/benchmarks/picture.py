@@ -18,7 +18,7 @@ import numpy as np
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.formats.refined import read_final_keypoints
+from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.files import read_pixels

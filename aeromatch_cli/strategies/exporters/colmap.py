@@ -20,8 +20,7 @@ from pydantic import Field
 
 from aeromatch_cli.data import Camera, Image, IntArray, Pose
 from aeromatch_cli.errors import WorkspaceError
-from aeromatch_cli.formats.adjusted import orientation_text
-from aeromatch_cli.formats.residuals import residuals_text
+from aeromatch_cli.formats.adjusted import orientation_text, residuals_text
 from aeromatch_cli.geometry.cameras import colmap_camera
 from aeromatch_cli.geometry.epipolar import fundamental
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
