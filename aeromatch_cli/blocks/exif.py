@@ -1,4 +1,4 @@
-"""What an image file says of itself in its header: EXIF, GPS and XMP. Pixels are never decoded.
+"""What an image file says of itself in its header: EXIF, GPS, maker notes and XMP. Pixels are never decoded.
 
 What XMP says is read by `xmp` and `calibration`.
 """
@@ -17,7 +17,6 @@ from typing import Any
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigmas_m
-from aeromatch_cli.blocks.maker_notes import dji_camera_angles
 from aeromatch_cli.blocks.packets import Packets, jp2_packets, jpeg_packets, png_packets
 from aeromatch_cli.blocks.xmp import (
     CameraAngles,
@@ -77,6 +76,9 @@ _CROP_FACTORS, _SAME_LENGTH = (0.4, 15.0), 1.25
 _TAKEN_NORTH_EAST = ": it counts as north and east; where that is wrong, write the letters (exiftool) or give --poses"
 # What Pillow raises on headers that are cut or scrambled.
 _BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, struct.error)
+# CameraPitch, CameraYaw and CameraRoll in DJI's maker notes, an IFD without a head. Source: ExifTool, DJI tags.
+_DJI_ANGLES = {"Yaw": 10, "Pitch": 9, "Roll": 11}
+_FLOAT, _ENTRY_BYTES = 11, 12
 
 
 @dataclass(frozen=True)
@@ -494,3 +496,21 @@ def _serial(value: Any) -> str:
 def _positive(value: Any) -> float | None:
     number = tag_number(value)
     return number if number is not None and number > 0 else None
+
+
+def dji_camera_angles(note: Any) -> dict[str, str]:
+    """Return the angles of the camera in DJI's maker notes, which remain where programs have dropped the XMP.
+
+    They stand under the names that XMP has for them, in degrees as there; none where one is missing.
+    """
+    if not isinstance(note, bytes):
+        return {}
+    for order in "<>":
+        found: dict[int, float] = {}
+        for start in range(2, len(note) - _ENTRY_BYTES + 1, _ENTRY_BYTES):
+            tag, kind, count, value = struct.unpack_from(f"{order}HHIf", note, start)
+            if kind == _FLOAT and count == 1:
+                found.setdefault(tag, value)
+        if found.keys() >= set(_DJI_ANGLES.values()):
+            return {f"drone-dji:Gimbal{name}Degree": f"{found[tag]:.2f}" for name, tag in _DJI_ANGLES.items()}
+    return {}

@@ -38,9 +38,8 @@ from aeromatch_cli.blocks.crs import (
 from aeromatch_cli.blocks.doubles import in_two_formats, thumbnails
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.exif_and_xmp import settled, with_conventions
-from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
 from aeromatch_cli.blocks.image_names import matched_rows
-from aeromatch_cli.blocks.left_out import excluded
+from aeromatch_cli.blocks.left_out import excluded, ground_shots, remarks_on_ground_shots
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
     Located,
@@ -186,7 +185,7 @@ def block_inputs(
     warnings += said
     facts = {name: fact for name, fact in facts.items() if not fact.panorama}
     shots = ground_shots(facts)
-    warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
+    warnings += remarks_on_ground_shots(shots, len(facts), dropped=drop_ground_shots)
     if drop_ground_shots:
         facts = {name: fact for name, fact in facts.items() if name not in shots}
     rows: dict[str, PoseRow] = {}

@@ -14,9 +14,8 @@ from pydantic import Field
 from aeromatch_cli.data import Camera, Features, FloatArray, IntArray
 from aeromatch_cli.strategies import Strategy, ViewPixels
 from aeromatch_cli.strategies.extractors.detection import Raw, concatenate, in_source
-from aeromatch_cli.strategies.extractors.merging import merge_keypoints
 from aeromatch_cli.strategies.extractors.reduction import factor_for, in_reduced_views, in_whole_views, reduced
-from aeromatch_cli.strategies.extractors.selection import distinct, even_selection
+from aeromatch_cli.strategies.extractors.selection import distinct, even_selection, merge_keypoints
 
 # Answers this close, at sizes within a factor of two, are one blob.
 _SAME_BLOB_PX = 2.0
