@@ -19,7 +19,8 @@ from aeromatch_cli.blocks.crs import (
     rounded_origin_m,
 )
 from aeromatch_cli.blocks.exif import ExifFacts
-from aeromatch_cli.blocks.poses import AttitudeKind, PoseRow, PositionKind
+from aeromatch_cli.blocks.pose_columns import AttitudeKind, PositionKind
+from aeromatch_cli.blocks.poses import PoseRow
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.angles import Angles

@@ -22,9 +22,10 @@ import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.lenses import of_metashape
+from aeromatch_cli.blocks.pose_columns import PositionKind
 from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, geodetic
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.units import factor, named_column
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError

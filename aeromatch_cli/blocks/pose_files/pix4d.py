@@ -19,6 +19,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.fields import IMAGE, fields_of
+from aeromatch_cli.blocks.pose_columns import AttitudeKind, PositionKind, has_header
 from aeromatch_cli.blocks.pose_files.source import (
     CameraShelf,
     Source,
@@ -29,7 +30,7 @@ from aeromatch_cli.blocks.pose_files.source import (
     rotation_row,
     units_of_comments,
 )
-from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind, has_header
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.lenses import Nearest, brown
 

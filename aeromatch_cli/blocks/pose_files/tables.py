@@ -22,6 +22,7 @@ from pathlib import PureWindowsPath
 import numpy as np
 
 from aeromatch_cli.blocks.fields import fields_of, with_name, words_of
+from aeromatch_cli.blocks.pose_columns import has_header
 from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs
 from aeromatch_cli.blocks.pose_files.source import (
     Source,
@@ -32,7 +33,7 @@ from aeromatch_cli.blocks.pose_files.source import (
     rotation_row,
     units_of_comments,
 )
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, has_header
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.units import factor
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
