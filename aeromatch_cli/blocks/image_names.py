@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import PurePosixPath
 from typing import NamedTuple
@@ -83,41 +84,70 @@ def _matches(
         if taken:
             rows = {name: exposures[number] for name, number in taken.items()}
             return rows, [row.image for number, row in exposures.items() if number not in set(taken.values())]
-    by_key: dict[str, list[str]] = defaultdict(list)
-    for name in names:
-        path = PurePosixPath(name)
-        for key in {name.lower(), path.name.lower(), path.stem.lower(), str(path.with_suffix("")).lower()}:
-            by_key[key].append(name)
-    by_number = _numbered(names, {int(float(row.image)) for row in written if row.numbered})
-    alike = Counter(PurePosixPath(row.image.lower()).name for row in written)
-    exact = set(names)
-    rows = {row.image: row for row in written if row.image in exact}
+    candidates = _Candidates.of(names, written)
+    rows = {row.image: row for row in written if row.image in candidates.exact}
     absent: list[str] = []
     for row in written:
-        if row.image in exact:
+        if row.image in candidates.exact:
             continue
-        # Programs write paths of the machine that they ran on.
-        written_as = row.image.lower()
-        found = by_key.get(written_as) or by_key.get(PurePosixPath(written_as).name, [])
-        if not found and IMAGE.fullmatch(written_as):
-            stem = PurePosixPath(written_as).stem
-            # An image that has a line of its own is not meant by another.
-            found = [name for name in by_key.get(stem, []) if PurePosixPath(name).name.lower() not in alike]
+        found = candidates.by_name(row.image)
         if row.numbered and not found:
-            found = by_number.get(int(float(row.image)), [])
-            if found and len({PurePosixPath(name).parent for name in found}) == 1:
+            found = candidates.by_number.get(int(float(row.image)), [])
+            if len({PurePosixPath(name).parent for name in found}) == 1:
                 rows |= dict.fromkeys(found, row)  # the cameras of one exposure
                 continue
         if "/" in row.image:
-            several = alike[PurePosixPath(row.image.lower()).name] > 1
-            found = [name for name in found if rows.get(name, row).image not in exact]
-            found = [name for name in found if not several or _shared_folders(row.image, name)]
+            found = candidates.in_folders_of(row.image, found, rows)
         image = _only(row, found, rows, source)
         if image is None:
             absent.append(row.image)
         else:
             rows[image] = row
     return rows, absent
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """The images of a block by what a list may call them.
+
+    exact: their names. by_key: by whole name, file name and stem in small letters. by_number: by running number.
+    alike: file name in small letters -> how many lines of the list have it.
+    """
+
+    exact: Set[str]
+    by_key: Mapping[str, list[str]]
+    by_number: Mapping[int, list[str]]
+    alike: Counter[str]
+
+    @classmethod
+    def of(cls, names: Sequence[str], written: Sequence[PoseRow]) -> _Candidates:
+        by_key: dict[str, list[str]] = defaultdict(list)
+        for name in names:
+            path = PurePosixPath(name)
+            for key in {name.lower(), path.name.lower(), path.stem.lower(), str(path.with_suffix("")).lower()}:
+                by_key[key].append(name)
+        by_number = _numbered(names, {int(float(row.image)) for row in written if row.numbered})
+        alike = Counter(PurePosixPath(row.image.lower()).name for row in written)
+        return cls(set(names), by_key, by_number, alike)
+
+    def by_name(self, written: str) -> list[str]:
+        """Return the images that a name may mean. Programs write paths of the machine that they ran on."""
+        path = PurePosixPath(written.lower())
+        found = self.by_key.get(written.lower()) or self.by_key.get(path.name, [])
+        if found or not IMAGE.fullmatch(written.lower()):
+            return found
+        # An image that has a line of its own is not meant by another.
+        return [name for name in self.by_key.get(path.stem, []) if PurePosixPath(name).name.lower() not in self.alike]
+
+    def in_folders_of(self, written: str, found: Sequence[str], rows: Mapping[str, PoseRow]) -> list[str]:
+        """Return those of the images found that the path of a line may mean. rows: the lines that images have so far.
+
+        An image that its whole name means is out of the question; where several lines have the same file name, so is
+        one that shares no folder with the path.
+        """
+        several = self.alike[PurePosixPath(written.lower()).name] > 1
+        free = [name for name in found if name not in rows or rows[name].image not in self.exact]
+        return [name for name in free if not several or _shared_folders(written, name)]
 
 
 def _only(row: PoseRow, found: Sequence[str], rows: Mapping[str, PoseRow], source: str) -> str | None:

@@ -173,6 +173,73 @@ def block_inputs(
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
+    chosen = _chosen_images(headers, passed_over, exclude, drop_ground_shots=drop_ground_shots)
+    facts, warnings, failures = chosen.facts, [*chosen.warnings], [*chosen.failures]
+    rows, remarks = _rows_of_images(lists, list(headers), facts)
+    warnings += remarks
+    assignment = _assign_cameras(lists, facts, {name: row.camera for name, row in rows.items()})
+    warnings += assignment.warnings
+    failures += [ReadFailure(name, reason) for name, reason in assignment.reasons.items()]
+    facts = {name: fact for name, fact in facts.items() if name in assignment.camera_ids}
+    if not facts:
+        raise InputError(_nothing_left(images_dir, failures, warnings))
+
+    facts, remarks = _consistent_headers(lists, facts)
+    warnings += remarks
+    observations, remarks = _observations(lists, rows, facts)
+    warnings += remarks
+    with_file = lists.camera_file is not None
+    likely_focals, remarks = contradicting_exif(assignment, facts) if with_file else ({}, [])
+    warnings += remarks
+    sigmas = sigma_position_m, sigma_angle_deg
+    located, heights, remarks = _located(lists, observations, facts, crs, known_frame, sigmas, given_heights)
+    warnings += remarks
+    ground = _ground_hint(lists, located, facts)
+    angles = located.angles | _angles_alone(lists, facts, located.angles)
+    ids = image_ids(facts)
+    images = _images(ids, facts, assignment.camera_ids)
+    captures = captures_of(images, facts, located.poses, located.frame)
+    flight_of = flights(captures)
+    return BlockInputs(
+        images=images,
+        cameras=assignment.cameras,
+        poses={ids[name]: pose for name, pose in located.poses.items()},
+        angles={ids[name]: one for name, one in angles.items()},
+        crs=located.frame.crs,
+        origin_m=located.frame.origin_m,
+        ground_hint_z_m=ground.z_m,
+        ground_hint_source=ground.source,
+        ground_is_stated=ground.is_stated,
+        focal_sigmas=assignment.focal_sigmas,
+        likely_focals=likely_focals,
+        warnings=tuple(warnings),
+        failures=tuple(sorted(failures)),
+        unread=chosen.unread,
+        recognised=_recognised(lists, rows, headers, assignment.by_pose_file),
+        flights=flight_of,
+        velocities=velocities(captures, flight_of),
+        heights=heights,
+    )
+
+
+class _ChosenImages(NamedTuple):
+    """The images that a block has. facts: their headers, by name. unread, failures: what is left out, and why."""
+
+    facts: dict[str, ExifFacts]
+    unread: tuple[ReadFailure, ...]
+    failures: list[ReadFailure]
+    warnings: list[str]
+
+
+def _chosen_images(
+    headers: Mapping[str, ExifFacts | str],
+    passed_over: Sequence[ScanFailure],
+    exclude: str,
+    *,
+    drop_ground_shots: bool,
+) -> _ChosenImages:
+    """Return the images that the user does not leave out and whose headers are usable, without panoramas and, where
+    asked for, without pictures that were taken on the ground."""
     out, remarks = excluded(exclude, [*headers, *(one.name for one in passed_over if one.unread)])
     passed_over = [one for one in passed_over if one.name not in out]
     unread = tuple(ReadFailure(one.name, one.reason) for one in passed_over if one.unread)
@@ -181,74 +248,83 @@ def block_inputs(
     failures += [ReadFailure(name, why) for name, why in headers.items() if isinstance(why, str) and name not in out]
     facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str) and name not in out}
     panoramas, said = _panoramas(facts)
-    unread += panoramas
     warnings += said
     facts = {name: fact for name, fact in facts.items() if not fact.panorama}
     shots = ground_shots(facts)
     warnings += remarks_on_ground_shots(shots, len(facts), dropped=drop_ground_shots)
     if drop_ground_shots:
         facts = {name: fact for name, fact in facts.items() if name not in shots}
-    rows: dict[str, PoseRow] = {}
-    if lists.pose_list is not None:
-        times = {name: fact.time for name, fact in facts.items()}
-        rows, remarks = matched_rows(lists.pose_list, list(headers), f"pose list {lists.poses}", times)
-        warnings += [*lists.pose_list.warnings, *remarks]
-    assignment = _assign_cameras(lists, facts, {name: row.camera for name, row in rows.items()})
-    warnings += assignment.warnings
-    failures += [ReadFailure(name, reason) for name, reason in assignment.reasons.items()]
-    facts = {name: fact for name, fact in facts.items() if name in assignment.camera_ids}
-    if not facts:
-        raise InputError(_nothing_left(images_dir, failures, warnings))
+    return _ChosenImages(facts, unread + panoramas, failures, warnings)
 
-    warnings += _rasters(facts)
+
+def _rows_of_images(
+    lists: GivenLists, names: Sequence[str], facts: Mapping[str, ExifFacts]
+) -> tuple[dict[str, PoseRow], list[str]]:
+    """Return image name -> its line of the pose list, and remarks of the list; nothing without a list."""
+    if lists.pose_list is None:
+        return {}, []
+    times = {name: fact.time for name, fact in facts.items()}
+    rows, remarks = matched_rows(lists.pose_list, names, f"pose list {lists.poses}", times)
+    return rows, [*lists.pose_list.warnings, *remarks]
+
+
+def _consistent_headers(lists: GivenLists, facts: dict[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
+    """Return headers without the contradictions that a block as a whole shows, and remarks.
+
+    Of positions and angles they are said only where these come from the headers.
+    """
+    warnings = _rasters(facts)
     facts, remarks = settled(facts)
     warnings += remarks if lists.poses == EXIF else []
     sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
     warnings += [*in_two_formats(sizes_px), *thumbnails(sizes_px)]
     facts, remarks = with_conventions(facts)
     warnings += remarks if lists.poses == EXIF and lists.angles == "auto" else []
-    observations, remarks = _observations(lists, rows, facts)
-    warnings += remarks
-    camera_file = lists.camera_file
-    likely_focals, remarks = contradicting_exif(assignment, facts) if camera_file is not None else ({}, [])
-    warnings += remarks
+    return facts, warnings
+
+
+def _located(
+    lists: GivenLists,
+    observations: dict[str, Observation],
+    facts: Mapping[str, ExifFacts],
+    crs: str,
+    known_frame: WorldFrame | None,
+    sigmas: tuple[float, float],
+    given_heights: GivenHeights,
+) -> tuple[Located, str, list[str]]:
+    """Return the observations in the world frame, what its heights count from, and remarks.
+
+    crs, known_frame, given_heights: as of `block_inputs`. sigmas: of a position in metres and of an attitude in degrees
+    that states none.
+    """
     stated_crs = _stated_crs(lists, crs)
-    observations, remarks = _agreeing(lists, observations, facts, stated_crs if crs == AUTO and stated_crs else crs)
-    warnings += remarks
-    located = oriented(observations, crs, stated_crs, known_frame, sigma_position_m, sigma_angle_deg)
+    observations, warnings = _agreeing(lists, observations, facts, stated_crs if crs == AUTO and stated_crs else crs)
+    located = oriented(observations, crs, stated_crs, known_frame, *sigmas)
     located, heights, remarks = _in_world_heights(located, lists, crs, given_heights)
     warnings += remarks
-    frame, named_poses, angles = located.frame, located.poses, located.angles
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
     warnings += _level_flight(located, facts)
     warnings += _foreign_crs(located)
-    stated = None if _all_level(located) else _stated_ground(camera_file, frame, Path(lists.cameras).name)
-    hint_z_m, hint_source = stated or _relative_ground({} if _all_level(located) else named_poses, facts)
-    angles |= _angles_alone(lists, facts, angles)
-    ids = image_ids(facts)
-    images = _images(ids, facts, assignment.camera_ids)
-    captures = captures_of(images, facts, located.poses, located.frame)
-    flight_of = flights(captures)
-    return BlockInputs(
-        images=images,
-        cameras=assignment.cameras,
-        poses={ids[name]: pose for name, pose in named_poses.items()},
-        angles={ids[name]: one for name, one in angles.items()},
-        crs=frame.crs,
-        origin_m=frame.origin_m,
-        ground_hint_z_m=hint_z_m,
-        ground_hint_source=hint_source,
-        ground_is_stated=stated is not None,
-        focal_sigmas=assignment.focal_sigmas,
-        likely_focals=likely_focals,
-        warnings=tuple(warnings),
-        failures=tuple(sorted(failures)),
-        unread=unread,
-        recognised=_recognised(lists, rows, headers, assignment.by_pose_file),
-        flights=flight_of,
-        velocities=velocities(captures, flight_of),
-        heights=heights,
-    )
+    return located, heights, warnings
+
+
+class _GroundHint(NamedTuple):
+    """World height of the ground as the input states it, None for unknown; source: where it comes from, in words."""
+
+    z_m: float | None
+    source: str
+    is_stated: bool
+
+
+def _ground_hint(lists: GivenLists, located: Located, facts: Mapping[str, ExifFacts]) -> _GroundHint:
+    """Return the ground that the camera file states, else that below the relative altitudes; none where heights count
+    from the flight."""
+    if _all_level(located):
+        return _GroundHint(None, "", is_stated=False)
+    stated = _stated_ground(lists.camera_file, located.frame, Path(lists.cameras).name)
+    if stated is not None:
+        return _GroundHint(*stated, is_stated=True)
+    return _GroundHint(*_relative_ground(located.poses, facts), is_stated=False)
 
 
 def _recognised(lists: GivenLists, rows: Mapping[str, PoseRow], headers: Mapping[str, object], with_camera: int) -> str:
