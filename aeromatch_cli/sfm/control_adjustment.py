@@ -8,7 +8,7 @@ not fit the block, `fault_of_list` looks for what is wrong with it: a unit, exch
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -92,40 +92,26 @@ def with_control(
     images = set(outcome.images)
     base = _Block(outcome.result.network, outcome.result.state, outcome)
     seen = [point for point in surveyed if point.seen_by(images) >= 2 and np.isfinite(base.error_m(point)).all()]
-    control, checks = [p for p in seen if not p.check], [p for p in seen if p.check]
     if not seen:
         return outcome, None
-    without_m = np.array([base.error_m(point) for point in seen])
-    offset_m = np.median(without_m, axis=0)
+    control, checks = [p for p in seen if not p.check], [p for p in seen if p.check]
+    without_m = {point.name: base.error_m(point) for point in seen}
+    errors_m = np.array(list(without_m.values()))
+    offset_m = np.median(errors_m, axis=0)
     stated_m = np.array([point.position_m for point in seen])
-    fault = fault_of_list(stated_m + without_m, stated_m)
+    fault = fault_of_list(stated_m + errors_m, stated_m)
     if not control or fault or float(np.abs(offset_m).max()) > _FAR_M:
-        as_it_is = _rms(without_m[[seen.index(point) for point in checks]]) if checks else None
-        return outcome, ControlInGroup(
-            used=[],
-            wrong=[],
-            exchanged=[],
-            fault=fault,
-            held_out="check points",
-            held_out_rms_m=as_it_is,
-            without_rms_m=as_it_is,
-            kept=not control,
-        )
+        return outcome, _as_it_is(_errors(without_m, checks), fault, kept=not control)
     exchanged = _exchanged(base, control)
     used = [point for point in control if point.name not in exchanged]
-    wrong: list[str] = []
-    start = base.moved(-offset_m)
-    while True:
-        solved = start.adjusted(work, used)
-        rests = [solved.without([other for other in used if other is not point]) for point in used]
-        worst = _worst(solved, rests, len(used)) if len(used) >= _TELLING else None
-        if worst is None:
-            break
-        wrong.append(used.pop(worst).name)
-    errors_m = np.array([rest.error_m(point) for rest, point in zip(rests, used, strict=True)]).reshape(-1, 3)
+    solved, rests, used, wrong = _without_wrong(work, base.moved(-offset_m), used)
     held_out = checks or (used if len(used) > 1 else [])
-    held_out_m = np.array([solved.error_m(point) for point in checks]) if checks else errors_m
-    before_m = without_m[[seen.index(point) for point in held_out]] if held_out else np.zeros((0, 3))
+    if checks:
+        held_out_m = np.array([solved.error_m(point) for point in checks])
+    else:
+        errors = [rest.error_m(point) for rest, point in zip(rests, used, strict=True)]
+        held_out_m = np.array(errors).reshape(-1, 3)
+    before_m = _errors(without_m, held_out)
     sound = bool(np.isfinite(solved.state.centers_m).all())
     kept = sound and (not held_out or _size(held_out_m) <= _size(before_m))
     found = ControlInGroup(
@@ -143,6 +129,44 @@ def with_control(
     taken = replace(outcome, result=replace(solved.outcome.result, stated=outcome.result.stated))
     take_outcome(work, model, taken)
     return taken, found
+
+
+def _errors(errors_m: Mapping[str, FloatArray], points: Sequence[Surveyed]) -> FloatArray:
+    """Return the errors (N, 3) of some points. errors_m: by name of a point, (3,) each."""
+    return np.array([errors_m[point.name] for point in points]).reshape(-1, 3)
+
+
+def _as_it_is(check_errors_m: FloatArray, fault: str, *, kept: bool) -> ControlInGroup:
+    """Return what is known of control points that take no part, because they do not fit or because there are none.
+
+    check_errors_m: (N, 3) of the check points. fault: of the list. kept: whether the block lacks control points.
+    """
+    rms_m = _rms(check_errors_m)
+    return ControlInGroup(
+        used=[],
+        wrong=[],
+        exchanged=[],
+        fault=fault,
+        held_out="check points",
+        held_out_rms_m=rms_m,
+        without_rms_m=rms_m,
+        kept=kept,
+    )
+
+
+def _without_wrong(
+    work: Work, start: _Block, used: Sequence[Surveyed]
+) -> tuple[_Block, list[_Block], list[Surveyed], list[str]]:
+    """Return the block adjusted with control points, without each of them, those that are left, and those that
+    contradict the others: one after the other the worst is taken out."""
+    used, wrong = list(used), list[str]()
+    while True:
+        solved = start.adjusted(work, used)
+        rests = [solved.without([other for other in used if other is not point]) for point in used]
+        worst = _worst(solved, rests, len(used)) if len(used) >= _TELLING else None
+        if worst is None:
+            return solved, rests, used, wrong
+        wrong.append(used.pop(worst).name)
 
 
 @dataclass(frozen=True, eq=False)
