@@ -123,47 +123,69 @@ def oriented(
     poses keep their numbers. sigmas: where an observation states none. Raises ConfigError.
     """
     geographic = {name: o for name, o in observations.items() if o.position_kind == "geographic"}
-    latitudes = np.array([o.position[0] for o in geographic.values()])
-    longitudes = np.array([o.position[1] for o in geographic.values()])
-    automatic = crs.strip().lower() in ("", "auto") and stated_crs is None
-    code = (
-        known_frame.crs
-        if known_frame is not None and automatic and (known_frame.crs == LOCAL) == (not geographic)
-        else choose_crs(crs, stated_crs, latitudes.tolist(), longitudes.tolist())
-    )
+    degrees = np.array([o.position[:2] for o in geographic.values()]).reshape(-1, 2)
+    code = _code(crs, stated_crs, known_frame, degrees)
     grid = {name: np.array(o.position) for name, o in observations.items() if o.position_kind == "grid"}
     turns = _grid_turns(code, observations, grid)
     outside: list[str] = []
     if geographic:
-        xy_m = grid_from_geographic(code, latitudes, longitudes)
-        convergences = convergence_deg(code, latitudes, longitudes)
-        for row, (name, observation) in enumerate(geographic.items()):
-            if np.isfinite(xy_m[row]).all() and np.isfinite(convergences[row]):
-                grid[name] = np.array([*xy_m[row], observation.position[2]])
-                turns[name] = float(convergences[row])
-            else:
-                outside.append(name)
-        if len(outside) == len(geographic):
-            raise ConfigError(f"no position lies in the area of {code}: check --crs, and latitude against longitude")
+        projected, convergences, outside = _projected(code, geographic, degrees)
+        grid |= projected
+        turns |= convergences
     zeros = _grid_zeros(code, grid)
     grid = {name: center_m for name, center_m in grid.items() if name not in zeros}
     grid, level_m, level = _with_heights(grid)
     frame = WorldFrame(code, _origin_m(code, list(grid.values()), known_frame))
-    stated = {name: _angles(observations[name], turns[name]) for name in grid}
-    angles = {name: one for name, one in stated.items() if one is not None}
-    poses = {}
+    angles, poses = dict[str, Angles](), dict[str, Pose]()
     for name, center_m in grid.items():
-        sigmas_m = _sigmas_m(observations[name], sigma_position_m)
+        observation = observations[name]
+        stated = _angles(observation, turns[name])
+        if stated is not None:
+            angles[name] = stated
+        sigmas_m = _sigmas_m(observation, sigma_position_m)
         poses[name] = Pose(
             center_m=center_m - np.array(frame.origin_m),
-            world_rotation=angles[name].rotation if name in angles else None,
+            world_rotation=None if stated is None else stated.rotation,
             sigma_position_m=overall_sigma_m(sigmas_m),
-            sigma_angle_deg=observations[name].sigma_angle_deg or sigma_angle_deg,
+            sigma_angle_deg=observation.sigma_angle_deg or sigma_angle_deg,
             sigmas_m=sigmas_m if len(set(sigmas_m)) > 1 else None,
         )
     unusable = {f"lie outside the area of {code}": outside, "have the position (0, 0)": zeros}
     faults = {words: names for words, names in unusable.items() if names}
     return Located(frame, poses, angles, faults, level, level_m)
+
+
+def _code(crs: str, stated_crs: str | None, known_frame: WorldFrame | None, degrees: FloatArray) -> str:
+    """Return the CRS of the world: that of an earlier run where nothing names one and it suits, else as `choose_crs`.
+
+    degrees: latitudes and longitudes (N, 2) of the positions that have such.
+    """
+    automatic = crs.strip().lower() in ("", "auto") and stated_crs is None
+    if known_frame is not None and automatic and (known_frame.crs == LOCAL) == (not len(degrees)):
+        return known_frame.crs
+    return choose_crs(crs, stated_crs, degrees[:, 0].tolist(), degrees[:, 1].tolist())
+
+
+def _projected(
+    code: str, geographic: Mapping[str, Observation], degrees: FloatArray
+) -> tuple[dict[str, FloatArray], dict[str, float], list[str]]:
+    """Return centres (3,) in the grid of a CRS, meridian convergences in degrees, and names of positions outside.
+
+    degrees: (N, 2) latitudes and longitudes of the observations. Raises ConfigError where all lie outside.
+    """
+    latitudes, longitudes = degrees[:, 0], degrees[:, 1]
+    xy_m = grid_from_geographic(code, latitudes, longitudes)
+    convergences = convergence_deg(code, latitudes, longitudes)
+    grid, turns, outside = dict[str, FloatArray](), dict[str, float](), list[str]()
+    for row, (name, observation) in enumerate(geographic.items()):
+        if np.isfinite(xy_m[row]).all() and np.isfinite(convergences[row]):
+            grid[name] = np.array([*xy_m[row], observation.position[2]])
+            turns[name] = float(convergences[row])
+        else:
+            outside.append(name)
+    if len(outside) == len(geographic):
+        raise ConfigError(f"no position lies in the area of {code}: check --crs, and latitude against longitude")
+    return grid, turns, outside
 
 
 def _sigmas_m(observation: Observation, usual_m: float) -> Sigmas:
