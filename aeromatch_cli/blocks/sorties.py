@@ -27,7 +27,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.crs import LOCAL, WorldFrame, convergence_deg, geographic_from_grid
 from aeromatch_cli.blocks.exif import ExifFacts
-from aeromatch_cli.data import FloatArray, Image, Pose
+from aeromatch_cli.data import BoolArray, FloatArray, Image, Pose
 
 _DAY_S = 86400.0
 # What is longer than this, and than so many usual intervals, is a landing: nobody changes a battery in less. Aircraft
@@ -252,22 +252,15 @@ def _time_s(one: Capture) -> float:
 
 
 def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
-    """Velocities of images on straight lines, by the images before and after them on the same line."""
+    """Return the velocities of images on straight lines, by the images before and after them on the same line."""
     track = sorted((one for one in group if one.time_s is not None and one.center_m is not None), key=_time_s)
     if len(track) < 3:
         return {}
     times_s = np.array([_time_s(one) for one in track])
     centers_m = np.array([one.center_m for one in track])
-    gaps_s, ways_m = np.diff(times_s), np.diff(centers_m, axis=0)
-    if not (gaps_s > 0.0).any():
+    if not (np.diff(times_s) > 0.0).any():
         return {}
-    lengths_m = np.hypot(ways_m[:, 0], ways_m[:, 1])
-    near = (gaps_s > 0.0) & (gaps_s <= _NEAR_INTERVALS * np.median(gaps_s[gaps_s > 0.0])) & (lengths_m > 0.0)
-    along = (ways_m[1:, :2] * ways_m[:-1, :2]).sum(axis=1)
-    ahead = along >= math.cos(math.radians(_TURN_DEG)) * lengths_m[1:] * lengths_m[:-1]
-    on = np.concatenate([[False], near[1:] & near[:-1] & ahead, [False]])  # at an image the line goes on
-    beside = np.concatenate([[False], near[:-1]]) | np.concatenate([near[1:], [False]])
-    flown = near & (on[:-1] | on[1:] | ~beside)  # from image to image: not on the way to another line
+    on, flown = _lines_of_track(times_s, centers_m)
     reach = _REACH if (times_s % 1.0).any() else _REACH_WHOLE_SECONDS
     found = {}
     for row in range(len(track)):
@@ -282,3 +275,16 @@ def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
         if np.linalg.norm(velocity) <= _FASTEST_M_S:
             found[track[row].image_id] = velocity
     return found
+
+
+def _lines_of_track(times_s: FloatArray, centers_m: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Return at which images (N,) of a track a line goes on, and which ways (N - 1,) from image to image are flown on
+    a line, not on the way to another one. times_s (N,) ascending, two of them apart; centers_m (N, 3)."""
+    gaps_s, ways_m = np.diff(times_s), np.diff(centers_m, axis=0)
+    lengths_m = np.hypot(ways_m[:, 0], ways_m[:, 1])
+    near = (gaps_s > 0.0) & (gaps_s <= _NEAR_INTERVALS * np.median(gaps_s[gaps_s > 0.0])) & (lengths_m > 0.0)
+    along = (ways_m[1:, :2] * ways_m[:-1, :2]).sum(axis=1)
+    ahead = along >= math.cos(math.radians(_TURN_DEG)) * lengths_m[1:] * lengths_m[:-1]
+    on = np.concatenate([[False], near[1:] & near[:-1] & ahead, [False]])
+    beside = np.concatenate([[False], near[:-1]]) | np.concatenate([near[1:], [False]])
+    return on, near & (on[:-1] | on[1:] | ~beside)
