@@ -207,12 +207,13 @@ def _without_zeros(facts: Mapping[str, ExifFacts]) -> tuple[Facts, list[str]]:
         return {}, []
     zeros = [name for name, fact in placed.items() if fact.altitude_m == 0.0]
     said = f"GPSAltitude is 0 in {len(zeros)} of {len(facts)} images" if zeros else "no image states an altitude"
-    if any(fact.relative_altitude_m for fact in placed.values()) and all(
-        fact.relative_altitude_m is not None for fact in placed.values()
-    ):
+    above_m = [fact.relative_altitude_m for fact in placed.values()]
+    if None not in above_m and any(above_m):
         above = {name: replace(fact, altitude_m=fact.relative_altitude_m) for name, fact in placed.items()}
         return above, [f"{said}: heights above the take-off point (RelativeAltitude) are used"]
-    return {name: replace(placed[name], altitude_m=None) for name in zeros}, [f"{said}: not used"] if zeros else []
+    if not zeros:
+        return {}, []
+    return {name: replace(placed[name], altitude_m=None) for name in zeros}, [f"{said}: not used"]
 
 
 def _two_levels(facts: Mapping[str, ExifFacts]) -> list[str]:

@@ -149,7 +149,7 @@ def _by_aircraft(captures: Iterable[Capture]) -> list[list[Capture]]:
 
 def _of_aircraft(group: Sequence[Capture]) -> list[list[Capture]]:
     timed = sorted((one for one in group if one.time_s is not None), key=lambda one: (_time_s(one), _place(one)))
-    parts = [part for piece in _cut(timed, _landings(timed)) for part in _cut(piece, _moved_takeoffs(piece))]
+    parts = _flown_apart(timed, _landings(timed))
     number = {one.image_id: row for row, part in enumerate(parts) for one in part}
     rest: list[Capture] = []
     for series in _series(group):
@@ -162,7 +162,15 @@ def _of_aircraft(group: Sequence[Capture]) -> list[list[Capture]]:
             elif one.image_id not in number:
                 parts[latest].append(one)
     for series in _series(rest):
-        parts += [part for piece in _cut(series, _gaps(series)) for part in _cut(piece, _moved_takeoffs(piece))]
+        parts += _flown_apart(series, _gaps(series))
+    return parts
+
+
+def _flown_apart(sequence: Sequence[Capture], starts: Iterable[int]) -> list[list[Capture]]:
+    """Return the parts of a sequence that begin at the given places, or where the take-off point has moved."""
+    parts = []
+    for piece in _cut(sequence, starts):
+        parts += _cut(piece, _moved_takeoffs(piece))
     return parts
 
 
@@ -264,17 +272,24 @@ def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
     reach = _REACH if (times_s % 1.0).any() else _REACH_WHOLE_SECONDS
     found = {}
     for row in range(len(track)):
-        first = last = row
-        while first > 0 and flown[first - 1] and (on[first] or first == row) and row - first < reach:
-            first -= 1
-        while last < len(flown) and flown[last] and (on[last] or last == row) and last - row < reach:
-            last += 1
+        first, last = _ends_of_line(row, on, flown, reach)
         if first == last or (first < row < last and not on[row]):  # at a corner two lines meet
             continue
         velocity = (centers_m[last] - centers_m[first]) / (times_s[last] - times_s[first])
         if np.linalg.norm(velocity) <= _FASTEST_M_S:
             found[track[row].image_id] = velocity
     return found
+
+
+def _ends_of_line(row: int, on: BoolArray, flown: BoolArray, reach: int) -> tuple[int, int]:
+    """Return the first and the last image on the line of an image, `reach` places away at most. on, flown: as of
+    `_lines_of_track`."""
+    first = last = row
+    while first > 0 and flown[first - 1] and (on[first] or first == row) and row - first < reach:
+        first -= 1
+    while last < len(flown) and flown[last] and (on[last] or last == row) and last - row < reach:
+        last += 1
+    return first, last
 
 
 def _lines_of_track(times_s: FloatArray, centers_m: FloatArray) -> tuple[BoolArray, BoolArray]:

@@ -133,9 +133,11 @@ def statements_of(lines: Iterable[str], mark: str = "#") -> Statements:
 
 
 def quantity_of(words: str) -> Quantity | None:
-    """What a column of units is of, by its words; None for something else."""
+    """Return what a column of units is of, by its words; None for something else."""
     found = [_QUANTITIES.get(word) for word in words.split("_") if word]
-    return (found[0] if found else "all") if None not in found else None
+    if None in found:
+        return None
+    return found[0] if found else "all"
 
 
 def _names_columns(text: str) -> bool:
@@ -232,13 +234,16 @@ def _phrases(words: Sequence[str]) -> Iterator[list[_Item]]:
 
 
 def _unit_at(words: Sequence[str], place: int) -> tuple[str, int]:
-    """The unit that begins at a word, and of how many words it is; "", 0 for none."""
-    for count in (4, 3, 2, 1) if words[place] != "m" else (1,):
+    """Return the unit that begins at a word, and of how many words it is; "", 0 for none."""
+    most = 1 if words[place] == "m" else min(4, len(words) - place)
+    for count in range(most, 0, -1):
         text = "".join(words[place : place + count])
-        if len(words) >= place + count and kind_of(text) and (len(text) > 1 or text in ("m", "°")) and text != "cc":
-            foreign = words[place - 1] if place and words[place - 1] in _FOREIGN else ""
-            return f"{foreign} {text}".strip() if foreign else text, count
-    return ("", 0)
+        if not kind_of(text) or text == "cc" or (len(text) == 1 and text not in ("m", "°")):
+            continue
+        if place and words[place - 1] in _FOREIGN:
+            return f"{words[place - 1]} {text}", count
+        return text, count
+    return "", 0
 
 
 def _meant(items: Sequence[_Item]) -> Sequence[Quantity]:

@@ -201,8 +201,13 @@ def xmp_position(xmp: Mapping[str, str]) -> tuple[float | None, float | None, fl
 
 def has_signs(xmp: Mapping[str, str]) -> bool:
     """Whether both degrees of the position say on which side they count: by a sign, by a letter, or by a tag."""
-    stated = (next((name for name in names if xmp.get(name)), "") for names in (_LATITUDES, _LONGITUDES))
-    return all(name and (re.search(r"[-+NSEW]", xmp[name]) or xmp.get(f"{name}Ref")) for name in stated)
+    for names in (_LATITUDES, _LONGITUDES):
+        stated = next((name for name in names if xmp.get(name)), "")
+        if not stated:
+            return False
+        if not re.search(r"[-+NSEW]", xmp[stated]) and not xmp.get(f"{stated}Ref"):
+            return False
+    return True
 
 
 def xmp_metres(xmp: Mapping[str, str], name: str) -> float | None:
@@ -256,7 +261,9 @@ def xmp_angles(xmp: Mapping[str, str]) -> CameraAngles | None:
 def xmp_speed_m_s(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
     """Of the aircraft to true north, to the east and down, metres per second; None where XMP does not state all."""
     north, east, down = (tag_number(xmp.get(f"drone-dji:Flight{axis}Speed")) for axis in "XYZ")
-    return None if north is None or east is None or down is None else (north, east, down)
+    if north is None or east is None or down is None:
+        return None
+    return north, east, down
 
 
 def xmp_band(xmp: Mapping[str, str]) -> str:

@@ -101,6 +101,8 @@ def differing(first: Any, second: Any, place: str = "") -> Iterator[tuple[str, A
 
 
 def _names(value: Any) -> list[Any]:
-    """Of a list of strategies; nothing of other values."""
-    strategies = isinstance(value, list) and all(isinstance(one, Mapping) and "name" in one for one in value)
-    return [one["name"] for one in value] if strategies else []
+    """Return the names of a list of strategies; nothing of other values."""
+    if not isinstance(value, list):
+        return []
+    names = [one["name"] for one in value if isinstance(one, Mapping) and "name" in one]
+    return names if len(names) == len(value) else []

@@ -110,7 +110,9 @@ def _larger(
     first, second = values
     even = abs(first - second) <= share * max(abs(first), abs(second))
     words = shown or (f"{first:,}", f"{second:,}")
-    return Criterion(what, *words, "neither" if even else "first" if first > second else "second")
+    if even:
+        return Criterion(what, *words, "neither")
+    return Criterion(what, *words, "first" if first > second else "second")
 
 
 @dataclass(frozen=True)

@@ -147,15 +147,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         block=_block_facts(context, in_world=adjustment.in_world),
         map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),
         fields=_ground_figures(context, adjusted, in_world=adjustment.in_world),
-        histograms=[
-            histogram(counts, f"verified matches per {words}", unit)
-            for counts, words, unit in (
-                ([row.verified for row in pairs if row.state == "verified"], "verified pair", "pairs"),
-                ([row.verified_matches for row in images], "image", "images"),
-            )
-            if any(counts)
-        ]
-        + point_figures(adjusted),
+        histograms=[*_histograms(images, pairs), *point_figures(adjusted)],
         evaluation=evaluation_figures(context.workspace),
         previews=previews(context, pairs),
         error_limits_px=ERROR_LIMITS_PX,
@@ -173,6 +165,18 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         stages=stages,
         settings=_settings_text(context),
     )
+
+
+def _histograms(images: Sequence[ImageRow], pairs: Sequence[PairRow]) -> list[str]:
+    """Draw how many verified matches pairs and images have; nothing where none has any."""
+    of_pairs = [row.verified for row in pairs if row.state == "verified"]
+    of_images = [row.verified_matches for row in images]
+    figures = []
+    if any(of_pairs):
+        figures.append(histogram(of_pairs, "verified matches per verified pair", "pairs"))
+    if any(of_images):
+        figures.append(histogram(of_images, "verified matches per image", "images"))
+    return figures
 
 
 def _quality(context: Context, adjustment: Adjustment) -> Quality | None:

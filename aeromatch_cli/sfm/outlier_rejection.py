@@ -185,9 +185,12 @@ def _masks(
     """Return, for every pair, which matches (M,) contradict the block; None where it is not judged. group: of the
     images that are."""
     held = [p.image_id0 in group and group[p.image_id0] == group.get(p.image_id1) for p in pairs]
-    ends = [view.keypoints_of(pair) if judged else None for pair, judged in zip(pairs, held, strict=True)]
-    ties = _Ties.of(len(view.rays), [both for both in ends if both is not None])
-    return [None if both is None else _judged(view, ties, *both, limits) for both in ends]
+    ends = {n: view.keypoints_of(pair) for n, pair in enumerate(pairs) if held[n]}
+    ties = _Ties.of(len(view.rays), list(ends.values()))
+    masks: list[BoolArray | None] = [None] * len(pairs)
+    for n, both in ends.items():
+        masks[n] = _judged(view, ties, *both, limits)
+    return masks
 
 
 def _worst_held(pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray | None]) -> set[str]:

@@ -88,11 +88,18 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             "the given one is used"
         )
     system = system or StatedCrs()
-    code = system.crs if system.crs and len(system.crs) < _LONGEST_CODE else system.name
-    words += [(code if system.crs else "WGS84" if system.kind == "geographic" else "local")] if stated_one else []
+    if stated_one:
+        words.append(_crs_words(system))
     title = f"Metashape reference, {', '.join(words)}"
     warnings = (*system.remarks, *remarks)
     return PoseList(tuple(rows), system.kind, warnings, title, system.crs, heights=system.heights)
+
+
+def _crs_words(system: StatedCrs) -> str:
+    """Return in few words what the coordinates count in."""
+    if not system.crs:
+        return "WGS84" if system.kind == "geographic" else "local"
+    return system.crs if len(system.crs) < _LONGEST_CODE else system.name
 
 
 def _unquoted(line: str) -> str:
@@ -132,7 +139,11 @@ def _factors(where: str, columns: Sequence[str], units: Sequence[str], system: S
         turns = bool(parts & set(_ANGLES[0] + _ANGLES[1])) or (geographic and name[:1] in "xy" and parts <= {"x", "y"})
         if unit and (turns or parts <= {"x", "y", "z", "accuracy"}):
             stem = name.removesuffix("_est")
-            one = system.up_m if stem == "z" else system.across_m if stem in ("x", "y") else 1.0
+            one = 1.0
+            if stem == "z":
+                one = system.up_m
+            elif stem in ("x", "y"):
+                one = system.across_m
             found[name] = factor(where, name, unit, "angle" if turns else "length") / one
             if name.startswith("accuracy_"):
                 found |= {f"accuracy_{part}": found[name] for part in parts}

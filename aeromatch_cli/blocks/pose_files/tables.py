@@ -53,11 +53,7 @@ def is_plain_table(source: Source) -> bool:
         return False
     records = [record for _, (_, record) in zip(range(3), source.records(), strict=False)]
     tables = [_without_further(with_name(fields_of(record)[0], 0)) for record in records]
-    return bool(tables) and all(
-        (len(cells) == len(_NAMES) and all(map(is_number, cells[1:])) and not is_number(cells[0]))
-        or (len(cells) == len(_NAMES) and all(map(is_number, cells)))
-        for cells in tables
-    )
+    return bool(tables) and all(len(cells) == len(_NAMES) and all(map(is_number, cells[1:])) for cells in tables)
 
 
 def _without_further(cells: list[str]) -> list[str]:
