@@ -35,7 +35,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -301,14 +301,9 @@ def _row(path: Path, number: int, cells: list[str], layout: Layout, faults: _Fau
         faults.setdefault("position (0, 0), treated as unposed", {})[number] = line.image
     else:
         position = x, y, math.nan if z is None else z
-    attitude = tuple(value for value in values if value is not None)
-    if len(attitude) < len(values):
-        if x is not None and y is not None:
-            missing = "attitude is incomplete" if attitude else "no attitude"
-            faults.setdefault(f"{missing}, position only", {})[number] = line.image
-        attitude = ()
-    if len(attitude) == 4 and abs(math.hypot(*attitude) - 1.0) > 0.05:
-        raise ConfigError(f"{path}, line {number}: qw,qx,qy,qz has length {math.hypot(*attitude):.3g}, not 1")
+    attitude, lacks = _whole_attitude(line, values)
+    if lacks and x is not None and y is not None:
+        faults.setdefault(f"{lacks}, position only", {})[number] = line.image
     return PoseRow(
         image=line.image,
         line=number,
@@ -348,6 +343,18 @@ def _sigmas(line: _Line) -> tuple[Sigmas | None, float | None]:
     if angle_deg is None:
         angle_deg = max((turn for turn in turns if turn is not None), default=None)
     return completed_sigmas_m(x_m, y_m, z_m, across_m=across_m, overall_m=overall_m), angle_deg
+
+
+def _whole_attitude(line: _Line, values: Sequence[float | None]) -> tuple[tuple[float, ...], str]:
+    """Return an attitude, () where values are missing, and what it lacks, in words. Raises ConfigError for a quaternion
+    that is none."""
+    attitude = tuple(value for value in values if value is not None)
+    if len(attitude) < len(values):
+        return (), "attitude is incomplete" if attitude else "no attitude"
+    if len(attitude) == 4 and abs(math.hypot(*attitude) - 1.0) > 0.05:
+        where = f"{line.path}, line {line.number}"
+        raise ConfigError(f"{where}: qw,qx,qy,qz has length {math.hypot(*attitude):.3g}, not 1")
+    return attitude, ""
 
 
 def _horizontal(line: _Line) -> tuple[float | None, float | None]:

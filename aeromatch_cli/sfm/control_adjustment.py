@@ -106,11 +106,7 @@ def with_control(
     used = [point for point in control if point.name not in exchanged]
     solved, rests, used, wrong = _without_wrong(work, base.moved(-offset_m), used)
     held_out = checks or (used if len(used) > 1 else [])
-    if checks:
-        held_out_m = np.array([solved.error_m(point) for point in checks])
-    else:
-        errors = [rest.error_m(point) for rest, point in zip(rests, used, strict=True)]
-        held_out_m = np.array(errors).reshape(-1, 3)
+    held_out_m = _held_out_errors_m(solved, rests, used, checks)
     before_m = _errors(without_m, held_out)
     sound = bool(np.isfinite(solved.state.centers_m).all())
     kept = sound and (not held_out or _size(held_out_m) <= _size(before_m))
@@ -134,6 +130,17 @@ def with_control(
 def _errors(errors_m: Mapping[str, FloatArray], points: Sequence[Surveyed]) -> FloatArray:
     """Return the errors (N, 3) of some points. errors_m: by name of a point, (3,) each."""
     return np.array([errors_m[point.name] for point in points]).reshape(-1, 3)
+
+
+def _held_out_errors_m(
+    solved: _Block, rests: Sequence[_Block], used: Sequence[Surveyed], checks: Sequence[Surveyed]
+) -> FloatArray:
+    """Return the errors (N, 3) at check points, without any at every control point in the block without it. rests: the
+    block without each point of `used`."""
+    if checks:
+        return np.array([solved.error_m(point) for point in checks])
+    errors_m = [rest.error_m(point) for rest, point in zip(rests, used, strict=True)]
+    return np.array(errors_m).reshape(-1, 3)
 
 
 def _as_it_is(check_errors_m: FloatArray, fault: str, *, kept: bool) -> ControlInGroup:
