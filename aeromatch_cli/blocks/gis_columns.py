@@ -48,25 +48,27 @@ def _expanded(lines: Sequence[str], header: int, separator: str, column: int) ->
         return list(lines)
     heights = any(point[4] for point in found)
     stated = any(point[1] for point in found)
-    in_degrees = all(_is_in_degrees(point) for point in found)
-    new = ["lon", "lat"] if in_degrees else ["x", "y"]
-    if heights:
-        new.append("alt" if in_degrees else "z")
-    if stated:
-        new.append("crs")
     others = _COORDINATES | (_HEIGHTS if heights else frozenset())
     unread = {place for place, name in enumerate(records[header]) if _bare(name) in others} | {column}
+    values = {header: _new_columns(found, heights=heights, stated=stated)}
+    for k, point in points.items():
+        values[k] = _coordinates(point, heights=heights, stated=stated)
     out = list(lines)
-    for k, cells in records.items():
-        if k == header:
-            values = new
-        elif k in points:
-            values = _coordinates(points[k], heights=heights, stated=stated)
-        else:
-            continue
-        kept = [cell for place, cell in enumerate(cells) if place not in unread]
-        out[k] = _line([*kept, *values], separator)
+    for k, new in values.items():
+        kept = [cell for place, cell in enumerate(records[k]) if place not in unread]
+        out[k] = _line([*kept, *new], separator)
     return out
+
+
+def _new_columns(points: Sequence[re.Match[str]], *, heights: bool, stated: bool) -> list[str]:
+    """Return the names of the columns of coordinates. heights, stated: whether there are heights and CRSs."""
+    in_degrees = all(_is_in_degrees(point) for point in points)
+    names = ["lon", "lat"] if in_degrees else ["x", "y"]
+    if heights:
+        names.append("alt" if in_degrees else "z")
+    if stated:
+        names.append("crs")
+    return names
 
 
 def _is_plain(line: str) -> bool:

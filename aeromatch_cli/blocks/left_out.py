@@ -95,19 +95,23 @@ def remarks_on_ground_shots(shots: Mapping[str, str], total: int, *, dropped: bo
 def _standing(facts: Mapping[str, ExifFacts]) -> list[str]:
     """Those that stand at the take-off point: where heights above it are known they are 0, else the lowest ones."""
     above_takeoff = all(fact.relative_altitude_m is not None for fact in facts.values())
-    heights = {
-        name: height
-        for name, fact in facts.items()
-        if (height := fact.relative_altitude_m if above_takeoff else fact.altitude_m) is not None
-    }
-    if len(heights) < _LEAST_IMAGES:
+    heights_m = {}
+    for name, fact in facts.items():
+        height_m = fact.relative_altitude_m if above_takeoff else fact.altitude_m
+        if height_m is not None:
+            heights_m[name] = height_m
+    if len(heights_m) < _LEAST_IMAGES:
         return []
-    zero = 0.0 if above_takeoff else min(heights.values())
-    low = [name for name, height in heights.items() if abs(height - zero) <= _LEVEL_M]
-    others = [abs(height - zero) for name, height in heights.items() if name not in low]
-    if not low or len(low) > _SHARE * len(heights) or min(others) < _GAP_M:
+    zero_m = 0.0 if above_takeoff else min(heights_m.values())
+    off_m = {name: abs(height_m - zero_m) for name, height_m in heights_m.items()}
+    low = [name for name, apart_m in off_m.items() if apart_m <= _LEVEL_M]
+    if not low or len(low) > _SHARE * len(heights_m):
         return []
-    return low if above_takeoff or _at_one_place([facts[name] for name in low]) else []
+    if min(apart_m for apart_m in off_m.values() if not apart_m <= _LEVEL_M) < _GAP_M:
+        return []
+    if above_takeoff or _at_one_place([facts[name] for name in low]):
+        return low
+    return []
 
 
 def _at_one_place(facts: list[ExifFacts]) -> bool:

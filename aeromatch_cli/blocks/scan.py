@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,10 +81,7 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
         visited.add(real)
         subfolders[:] = sorted(name for name in subfolders if not name.startswith(".") and name != _THUMBNAILS)
         failures += _folders_like_images(folder, Path(parent), subfolders)
-        paths = [Path(parent) / name for name in files]
-        if files_passed_over:
-            paths = [path for path in paths if not _is_image(path) or os.path.realpath(path) not in files_passed_over]
-        found, unfit = _scan_paths(folder, paths)
+        found, unfit = _scan_paths(folder, [Path(parent) / name for name in files], files_passed_over)
         names += found
         failures += unfit
     kept, failures = _sorted_out(names, failures)
@@ -105,14 +102,19 @@ def _folders_like_images(folder: Path, parent: Path, subfolders: Sequence[str]) 
             yield ScanFailure(relative, "is a folder with the name of an image", False)
 
 
-def _scan_paths(folder: Path, paths: Sequence[Path]) -> tuple[list[str], list[ScanFailure]]:
-    """Return the relative names of those files that are images, and what is said of the others."""
+def _scan_paths(folder: Path, paths: Sequence[Path], passed_over: Set[str]) -> tuple[list[str], list[ScanFailure]]:
+    """Return the relative names of those files that are images, and what is said of the others.
+
+    passed_over: real paths of images that are not searched for.
+    """
     names: list[str] = []
     failures: list[ScanFailure] = []
     for path in paths:
         relative = path.relative_to(folder).as_posix()
         if not _is_image(path):
             failures += _unread(relative, path)
+        elif passed_over and os.path.realpath(path) in passed_over:
+            continue
         elif (failure := _failure_of(path, relative)) is not None:
             failures.append(failure)
         elif not path.name.startswith("."):

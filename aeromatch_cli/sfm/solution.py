@@ -192,7 +192,10 @@ def from_models(
     """
     block = evidence.block
     cameras, found = _of_models(block, models, before)
-    beside = {i for model in models if model.kind == "level" for i in model.rotations}
+    beside = set[str]()
+    for model in models:
+        if model.kind == "level":
+            beside.update(model.rotations)
     own = bool(models) and found.keys() <= beside
     # The mapper's own points are few: it leans on the longest tracks.
     lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
