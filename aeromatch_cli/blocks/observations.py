@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -14,8 +14,11 @@ from aeromatch_cli.blocks.crs import (
     WorldFrame,
     choose_crs,
     convergence_deg,
+    converted_heights,
     geographic_from_grid,
     grid_from_geographic,
+    heights_words,
+    outside_area,
     rounded_origin_m,
 )
 from aeromatch_cli.blocks.exif import ExifFacts
@@ -98,6 +101,11 @@ class Located(NamedTuple):
     level: Sequence[str]
     level_m: float
 
+    @property
+    def heights_from_flight(self) -> bool:
+        """Whether heights count from the flight: a ground that counts from elsewhere says nothing there."""
+        return bool(self.level) and len(self.level) == len(self.poses)
+
 
 def angles_of_exif(facts: ExifFacts, angles: AngleConvention) -> Angles | None:
     """Attitude that an image's header states, whether or not it states a position; yaw as it counts there."""
@@ -153,6 +161,60 @@ def oriented(
     unusable = {f"lie outside the area of {code}": outside, "have the position (0, 0)": zeros}
     faults = {words: names for words, names in unusable.items() if names}
     return Located(frame, poses, angles, faults, level, level_m)
+
+
+def in_world_heights(
+    located: Located, stated: str, wanted: str, crs: str, shift_m: float
+) -> tuple[Located, str, list[str]]:
+    """Return positions whose heights count from where the CRS says, what that is, "" for unknown, and remarks.
+
+    stated, wanted: what heights count from, as of `crs.heights_of`: as something states it, and by the CRS that the
+    user gave (crs); "" for unknown. shift_m: is added to the heights.
+    """
+    if located.heights_from_flight or not located.poses or located.frame.crs == LOCAL:
+        return located, "", []
+    origin_m = np.array(located.frame.origin_m)
+    places_m = np.array([pose.center_m for pose in located.poses.values()]) + origin_m
+    heights_m, own, remarks = _transformed(places_m, stated, wanted, located.frame.crs, crs)
+    if shift_m:
+        heights_m = heights_m + shift_m
+        remarks.append(f"heights of positions are shifted by {shift_m:+g} m, as block.height_shift_m asks")
+        own = wanted
+    poses = {
+        name: replace(pose, center_m=np.array([*pose.center_m[:2], height_m - origin_m[2]]))
+        for (name, pose), height_m in zip(located.poses.items(), heights_m, strict=True)
+    }
+    return located._replace(poses=poses), own, remarks
+
+
+def _transformed(
+    places_m: FloatArray, stated: str, wanted: str, code: str, crs: str
+) -> tuple[FloatArray, str, list[str]]:
+    """Return the heights (N,) of places (N, 3) in a CRS (code), what they count from, and remarks; transformed where
+    that is known and not what is wanted. crs: as the user gave it."""
+    if wanted and not stated:
+        remark = (
+            f"--crs {crs} names {heights_words(wanted)}, and nothing states what heights of positions count from: they "
+            "stay as they are; --set block.heights=ellipsoid has them transformed"
+        )
+        return places_m[:, 2], stated, [remark]
+    if not wanted or stated == wanted:
+        return places_m[:, 2], stated, []
+    heights_m, why_not = converted_heights(code, stated, wanted, places_m)
+    if why_not:
+        remark = f"positions: {why_not}; --set block.height_shift_m=METRES shifts them by a known height"
+        return heights_m, stated, [remark]
+    by_m = float(np.median(heights_m - places_m[:, 2]))
+    words = f"from {heights_words(stated)} to {heights_words(wanted)}"
+    return heights_m, wanted, [f"heights of positions are transformed {words}: {by_m:+.2f} m (median)"]
+
+
+def foreign_crs(located: Located) -> list[str]:
+    """Return what is said of a CRS that is used elsewhere."""
+    origin_m = np.array(located.frame.origin_m[:2])
+    places_m = np.array([pose.center_m[:2] for pose in located.poses.values()]).reshape(-1, 2) + origin_m
+    remark = outside_area(located.frame.crs, places_m)
+    return [remark] if remark else []
 
 
 def _code(crs: str, stated_crs: str | None, known_frame: WorldFrame | None, degrees: FloatArray) -> str:

@@ -30,10 +30,7 @@ from aeromatch_cli.blocks.crs import (
     WorldFrame,
     checked_crs,
     checked_heights,
-    converted_heights,
     heights_of,
-    heights_words,
-    outside_area,
 )
 from aeromatch_cli.blocks.doubles import in_two_formats, thumbnails
 from aeromatch_cli.blocks.exif import ExifFacts
@@ -45,6 +42,8 @@ from aeromatch_cli.blocks.observations import (
     Located,
     Observation,
     angles_of_exif,
+    foreign_crs,
+    in_world_heights,
     observation_of_exif,
     observation_of_row,
     oriented,
@@ -300,11 +299,13 @@ def _located(
     stated_crs = _stated_crs(lists, crs)
     observations, warnings = _agreeing(lists, observations, facts, stated_crs if crs == AUTO and stated_crs else crs)
     located = oriented(observations, crs, stated_crs, known_frame, *sigmas)
-    located, heights, remarks = _in_world_heights(located, lists, crs, given_heights)
+    wanted = heights_of(crs) if crs.strip().lower() not in ("", AUTO, LOCAL) else ""
+    stated = _stated_heights(lists, wanted, given_heights)
+    located, heights, remarks = in_world_heights(located, stated, wanted, crs, given_heights.shift_m)
     warnings += remarks
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
     warnings += _level_flight(located, facts)
-    warnings += _foreign_crs(located)
+    warnings += foreign_crs(located)
     return located, heights, warnings
 
 
@@ -319,7 +320,7 @@ class _GroundHint(NamedTuple):
 def _ground_hint(lists: GivenLists, located: Located, facts: Mapping[str, ExifFacts]) -> _GroundHint:
     """Return the ground that the camera file states, else that below the relative altitudes; none where heights count
     from the flight."""
-    if _all_level(located):
+    if located.heights_from_flight:
         return _GroundHint(None, "", is_stated=False)
     stated = _stated_ground(lists.camera_file, located.frame, Path(lists.cameras).name)
     if stated is not None:
@@ -504,70 +505,25 @@ def _with_exif_heights(
     return observations, [remark] if heights_m else []
 
 
-def _all_level(located: Located) -> bool:
-    """Whether heights count from the flight: a ground that counts from elsewhere says nothing there."""
-    return bool(located.level) and len(located.level) == len(located.poses)
-
-
-def _in_world_heights(
-    located: Located, lists: GivenLists, crs: str, given: GivenHeights
-) -> tuple[Located, str, list[str]]:
-    """Positions whose heights count from where the CRS says, what that is, "" for unknown, and remarks.
-
-    crs: as the user gave it: of it are positions in a grid of which nothing else is stated, heights included.
-    """
-    wanted = heights_of(crs) if crs.strip().lower() not in ("", AUTO, LOCAL) else ""
-    stated = lists.pose_list.heights if lists.pose_list is not None else ""
-    if not stated and lists.pose_list is not None and lists.pose_list.position_kind == "grid":
-        stated = wanted
-    own = checked_heights(given.zero) if given.zero.strip().lower() != AUTO else stated
-    if _all_level(located) or not located.poses or located.frame.crs == LOCAL:
-        return located, "", []
-    origin_m = np.array(located.frame.origin_m)
-    places_m = np.array([pose.center_m for pose in located.poses.values()]) + origin_m
-    heights_m, remarks = places_m[:, 2], list[str]()
-    if wanted and own and own != wanted:
-        heights_m, why_not = converted_heights(located.frame.crs, own, wanted, places_m)
-        if why_not:
-            remarks.append(f"positions: {why_not}; --set block.height_shift_m=METRES shifts them by a known height")
-        else:
-            by_m = float(np.median(heights_m - places_m[:, 2]))
-            words = f"from {heights_words(own)} to {heights_words(wanted)}"
-            remarks.append(f"heights of positions are transformed {words}: {by_m:+.2f} m (median)")
-            own = wanted
-    elif wanted and not own:
-        remarks.append(
-            f"--crs {crs} names {heights_words(wanted)}, and nothing states what heights of positions count from: they "
-            "stay as they are; --set block.heights=ellipsoid has them transformed"
-        )
-    if given.shift_m:
-        heights_m = heights_m + given.shift_m
-        remarks.append(f"heights of positions are shifted by {given.shift_m:+g} m, as block.height_shift_m asks")
-        own = wanted
-    poses = {
-        name: replace(pose, center_m=np.array([*pose.center_m[:2], height_m - origin_m[2]]))
-        for (name, pose), height_m in zip(located.poses.items(), heights_m, strict=True)
-    }
-    return located._replace(poses=poses), own, remarks
-
-
-def _foreign_crs(located: Located) -> list[str]:
-    """What is said of a CRS that is used elsewhere."""
-    origin = np.array(located.frame.origin_m[:2])
-    places = np.array([pose.center_m[:2] for pose in located.poses.values()]).reshape(-1, 2) + origin
-    remark = outside_area(located.frame.crs, places)
-    return [remark] if remark else []
+def _stated_heights(lists: GivenLists, wanted: str, given: GivenHeights) -> str:
+    """Return what heights of positions count from, as of `crs.heights_of`, "" for unknown: as the user says, else the
+    pose list; of a list in a grid that states nothing else, as the CRS says that the user gave (wanted)."""
+    if given.zero.strip().lower() != AUTO:
+        return checked_heights(given.zero)
+    if lists.pose_list is None:
+        return ""
+    if lists.pose_list.position_kind == "grid":
+        return lists.pose_list.heights or wanted
+    return lists.pose_list.heights
 
 
 def _level_flight(located: Located, facts: Mapping[str, ExifFacts]) -> list[str]:
-    """What is said of images without a height."""
+    """Return what is said of images without a height."""
     if not located.level:
         return []
-    zero = (
-        "0 m, so that heights count from the flight"
-        if _all_level(located)
-        else f"{located.level_m:.1f} m, that of the others"
-    )
+    zero = f"{located.level_m:.1f} m, that of the others"
+    if located.heights_from_flight:
+        zero = "0 m, so that heights count from the flight"
     return [f"{_count(located.level, facts)} have a position without height: a level flight at {zero}, is assumed"]
 
 
