@@ -103,11 +103,9 @@ def _of_words(comment: str, body: str) -> CrsComment | None:
 
 def _labelled(comment: str, label: str, mark: str, text: str) -> CrsComment | None:
     """Return the CRS behind a label, None where the text is none of a CRS. mark: between both, "" for a blank."""
+    if _is_no_crs(label, text):
+        return None
     code, datum = _CODE.search(text), _DATUM.match(text)
-    if is_datum(text) or (label == "datum" and names_datum(text.lower().split())):
-        return None  # of heights
-    if label == "datum" and text[:1].isdigit():
-        return None  # a date
     if label in ("epsg", "srid") and re.fullmatch(r":?\s*\d{4,6}(\+\d{4,6})?", text):
         return CrsComment(f"EPSG:{text.strip(': ')}")
     if not mark and (code or label in _LOOSE or (label == "datum" and datum is None)):
@@ -126,6 +124,13 @@ def _labelled(comment: str, label: str, mark: str, text: str) -> CrsComment | No
     if label == "datum":
         return CrsComment(rest=text, unclear=f"{comment!r} names no datum that is known: name a CRS, # CRS: EPSG:...")
     return CrsComment(text) if mark and label not in _OFTEN else None
+
+
+def _is_no_crs(label: str, text: str) -> bool:
+    """Whether the text behind a label is a datum of heights, or a date."""
+    if is_datum(text):
+        return True
+    return label == "datum" and (names_datum(text.lower().split()) or text[:1].isdigit())
 
 
 def _parsed_label(comment: str, label: str, text: str) -> CrsComment | None:

@@ -79,11 +79,10 @@ def _matches(
 ) -> tuple[dict[str, PoseRow], list[str]]:
     """Image name -> its line, and names of lines that mean no image."""
     exposures = {int(row.image): row for row in written if row.numbered and row.time_s is not None}
-    if exposures:
-        taken = numbers_of_exposures(names, times, {number: row.time_s or 0.0 for number, row in exposures.items()})
-        if taken:
-            rows = {name: exposures[number] for name, number in taken.items()}
-            return rows, [row.image for number, row in exposures.items() if number not in set(taken.values())]
+    by_exposure = _of_exposures(exposures, names, times)
+    if by_exposure:
+        used = {int(row.image) for row in by_exposure.values()}
+        return by_exposure, [row.image for number, row in exposures.items() if number not in used]
     candidates = _Candidates.of(names, written)
     rows = {row.image: row for row in written if row.image in candidates.exact}
     absent: list[str] = []
@@ -104,6 +103,16 @@ def _matches(
         else:
             rows[image] = row
     return rows, absent
+
+
+def _of_exposures(
+    exposures: Mapping[int, PoseRow], names: Sequence[str], times: Mapping[str, str]
+) -> dict[str, PoseRow]:
+    """Return image -> line of its exposure, by the order and the times of both; empty where these do not tell."""
+    if not exposures:
+        return {}
+    times_s = {number: row.time_s or 0.0 for number, row in exposures.items()}
+    return {name: exposures[number] for name, number in numbers_of_exposures(names, times, times_s).items()}
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ def refine(folder: Path) -> None:
             if not parts:
                 continue
             keep_images(model, parts[0])
-            waiting.extend({**group, "images": part} for part in parts[1:] if len(part) >= _FEWEST_IMAGES)
+            waiting.extend(_groups_of(group, parts[1:]))
         attitudes = _attitudes(model, given) if group["kind"] == "given" else ()
         registered: list[int] = []
         outcome: Outcome | None = None
@@ -123,6 +123,11 @@ def refine(folder: Path) -> None:
             result = adjusted_group(result, outcome, observed, names)
         models.append({"file": name, "result": result.as_json()})
     (folder / "result.json").write_text(json.dumps({"models": models}), encoding="utf-8")
+
+
+def _groups_of(group: dict[str, Any], parts: Sequence[Collection[int]]) -> list[dict[str, Any]]:
+    """Return the groups that parts of a group become, without parts of few images."""
+    return [{**group, "images": part} for part in parts if len(part) >= _FEWEST_IMAGES]
 
 
 def _clean(work: Work, model: Any, observed: Given) -> None:

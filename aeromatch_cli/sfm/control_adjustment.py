@@ -108,8 +108,7 @@ def with_control(
     held_out = checks or (used if len(used) > 1 else [])
     held_out_m = _held_out_errors_m(solved, rests, used, checks)
     before_m = _errors(without_m, held_out)
-    sound = bool(np.isfinite(solved.state.centers_m).all())
-    kept = sound and (not held_out or _size(held_out_m) <= _size(before_m))
+    kept = _is_as_good(solved, held_out_m, before_m)
     found = ControlInGroup(
         used=[point.name for point in used] if kept else [],
         wrong=wrong,
@@ -130,6 +129,13 @@ def with_control(
 def _errors(errors_m: Mapping[str, FloatArray], points: Sequence[Surveyed]) -> FloatArray:
     """Return the errors (N, 3) of some points. errors_m: by name of a point, (3,) each."""
     return np.array([errors_m[point.name] for point in points]).reshape(-1, 3)
+
+
+def _is_as_good(solved: _Block, held_out_m: FloatArray, before_m: FloatArray) -> bool:
+    """Whether a block is whole and its errors (N, 3) at held-out points are no larger than before."""
+    if not np.isfinite(solved.state.centers_m).all():
+        return False
+    return not len(before_m) or _size(held_out_m) <= _size(before_m)
 
 
 def _held_out_errors_m(

@@ -118,10 +118,9 @@ def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
     remarks += tuple(
         f"{source.path.name}: {words}" for words in (*more, *said.remarks, *(() if crs else said.not_whole))
     )
-    rows = [
-        (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
-        for line, cells, _ in records
-    ]
+    rows = []
+    for line, cells, _ in records:
+        rows.append((line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells)))
     stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys((*"xyz", "sigma_xy", "sigma_z"), "")
     points = _points(source, rows, _factors(source, header, stated, said, crs or usual_crs, crs_where))
     geographic = "latitude" in names or _in_degrees(points)
