@@ -66,7 +66,9 @@ def words_of_height(cell: str) -> tuple[str, str]:
             unit.append(word)
         else:
             return "", ""
-    if len(words) > 8 or not (_HEIGHT | _DATUMS_ALONE) & set(name) or (unit and kind_of("".join(unit)) is None):
+    if len(words) > 8 or not (_HEIGHT | _DATUMS_ALONE) & set(name):
+        return "", ""
+    if unit and kind_of("".join(unit)) is None:
         return "", ""
     return "_".join(name), "".join(unit)
 

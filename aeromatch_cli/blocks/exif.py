@@ -338,9 +338,13 @@ def _position(
 
 def _mirrored(own: tuple[float, float], others: tuple[float | None, float | None]) -> bool:
     """Whether two positions are the same but for signs."""
-    pairs = [(a, b) for a, b in zip(own, others, strict=True) if b is not None]
-    alike = all(abs(abs(a) - abs(b)) < _SAME_PLACE_DEG for a, b in pairs)
-    return len(pairs) == 2 and alike and any(abs(a - b) > _MIRRORED_DEG for a, b in pairs)
+    latitude, longitude = others
+    if latitude is None or longitude is None:
+        return False
+    pairs = (own[0], latitude), (own[1], longitude)
+    if not all(abs(abs(one) - abs(other)) < _SAME_PLACE_DEG for one, other in pairs):
+        return False
+    return any(abs(one - other) > _MIRRORED_DEG for one, other in pairs)
 
 
 def _exif_position(

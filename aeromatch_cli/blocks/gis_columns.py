@@ -85,8 +85,13 @@ def _is_in_degrees(point: re.Match[str]) -> bool:
 def _coordinates(point: re.Match[str] | None, *, heights: bool, stated: bool) -> list[str]:
     """Return the values of a point's columns, empty where it has none. heights, stated: whether there are columns of
     heights and of CRSs."""
-    numbers = (2, 3, *((4,) if heights else ()), *((1,) if stated else ()))
-    return ["" if point is None else point[number] or "" for number in numbers]
+    crs, x, y, height = ("", "", "", "") if point is None else point.groups(default="")
+    values = [x, y]
+    if heights:
+        values.append(height)
+    if stated:
+        values.append(crs)
+    return values
 
 
 def _bare(name: str) -> str:

@@ -113,9 +113,14 @@ def _world_from_ned(poses: Mapping[str, Pose], frame: WorldFrame) -> FloatArray 
 
 def flights(captures: Iterable[Capture]) -> dict[str, str]:
     """image_id -> name of its flight, "flight 1" being the first; of all images."""
-    found = [part for group in _by_aircraft(captures) for part in _of_aircraft(group)]
-    found.sort(key=lambda part: (min(_time_s(one) for one in part), _place(part[0])))
-    return {one.image_id: f"flight {number}" for number, part in enumerate(found, start=1) for one in part}
+    parts = []
+    for group in _by_aircraft(captures):
+        parts += _of_aircraft(group)
+    parts.sort(key=lambda part: (min(map(_time_s, part)), _place(part[0])))
+    names: dict[str, str] = {}
+    for number, part in enumerate(parts, start=1):
+        names |= dict.fromkeys([one.image_id for one in part], f"flight {number}")
+    return names
 
 
 def velocities(captures: Iterable[Capture], flight_of: Mapping[str, str]) -> dict[str, FloatArray]:

@@ -233,17 +233,24 @@ def _first_degrees(xmp: Mapping[str, str], names: Iterable[str], largest: float)
     """Degrees as a number, whose hemisphere may stand in a tag of its own or as a letter beside it ("N 52.5"), or in
     Adobe's way: "52,30.5712N", "52,30,34.27N"."""
     for name in names:
-        text = xmp.get(name, "")
-        number = tag_number(text)
-        if number is not None and xmp.get(f"{name}Ref", "")[:1].upper() in ("S", "W"):
-            number = -abs(number)
-        if number is None and (parts := _ADOBE_DEGREES.fullmatch(text)):
-            number = float(parts[1]) + float(parts[2]) / 60.0 + float(parts[3] or 0.0) / 3600.0
-            number = -number if parts[4] in "SW" else number
-        if number is None and (one := _LETTERED.fullmatch(text)) and bool(one[1]) != bool(one[3]):
-            number = -float(one[2]) if one[1] + one[3] in "SW" else float(one[2])
+        number = _degrees(xmp.get(name, ""), xmp.get(f"{name}Ref", ""))
         if number is not None and abs(number) <= largest:
             return number
+    return None
+
+
+def _degrees(text: str, reference: str) -> float | None:
+    """Return the degrees that a text states. reference: the side of the globe of a plain number."""
+    number = tag_number(text)
+    if number is not None:
+        return -abs(number) if reference[:1].upper() in ("S", "W") else number
+    parts = _ADOBE_DEGREES.fullmatch(text)
+    if parts:
+        number = float(parts[1]) + float(parts[2]) / 60.0 + float(parts[3] or 0.0) / 3600.0
+        return -number if parts[4] in "SW" else number
+    one = _LETTERED.fullmatch(text)
+    if one and bool(one[1]) != bool(one[3]):
+        return -float(one[2]) if one[1] + one[3] in "SW" else float(one[2])
     return None
 
 

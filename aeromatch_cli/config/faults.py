@@ -166,16 +166,18 @@ def _shown(value: Any) -> str:
 def _visible(location: tuple[Any, ...], families: Families) -> Iterator[Any]:
     """The location as `--set` would write it: without chain positions and the union tags that pydantic puts in."""
     family = families.get(str(location[0])) if location else None
-    chained = len(location) > 1 and isinstance(location[1], int)
-    for index, part in enumerate(location):
-        if isinstance(part, int):
-            # A chain's member is told by its name, which pydantic leaves out where the family has only one.
-            if family is not None and len(family) == 1 and index == 1 and len(location) > 2:
-                yield next(iter(family))
-            continue
-        is_tag = family is not None and len(family) > 1 and not chained and index == 1 and part in family
-        if not is_tag:
-            yield part
+    if family is None or len(location) < 2:
+        yield from (part for part in location if not isinstance(part, int))
+        return
+    section, second, *others = location
+    yield section
+    if isinstance(second, int):
+        # A chain's member is told by its name, which pydantic leaves out where the family has only one.
+        if len(family) == 1 and others:
+            yield next(iter(family))
+    elif len(family) == 1 or second not in family:
+        yield second
+    yield from (part for part in others if not isinstance(part, int))
 
 
 def _siblings(location: tuple[Any, ...], root: type[BaseModel], families: Families) -> list[str]:

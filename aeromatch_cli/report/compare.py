@@ -241,9 +241,14 @@ def _adjusted_lines(one: AdjustResult, two: AdjustResult) -> Iterator[str]:
 
 
 def _counts(words: str, first: float, second: float) -> str:
-    change = f" ({100.0 * (second / first - 1.0):+.1f} %)" if first and second != first else ""
-    shown = [f"{value:.2f}" if isinstance(value, float) else f"{value:,}" for value in (first, second)]
-    return f"{words:<11} {shown[0]} and {shown[1]}{change}"
+    change = ""
+    if first and second != first:
+        change = f" ({100.0 * (second / first - 1.0):+.1f} %)"
+    return f"{words:<11} {_number(first)} and {_number(second)}{change}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if isinstance(value, float) else f"{value:,}"
 
 
 def _side(root: Path) -> _Side:

@@ -419,6 +419,11 @@ def _stated(path: Path) -> Any:
 
 
 def _range(array: Any) -> str:
-    if array.dtype.kind not in "fiu" or not array.size:
-        return f", {', '.join(map(str, array.ravel()[:3]))}" if array.size and array.dtype.kind == "U" else ""
-    return f", {np.nanmin(array):.6g} to {np.nanmax(array):.6g}"
+    """Return the range of an array of numbers, the first values of one of text."""
+    if not array.size:
+        return ""
+    if array.dtype.kind in "fiu":
+        return f", {np.nanmin(array):.6g} to {np.nanmax(array):.6g}"
+    if array.dtype.kind == "U":
+        return f", {', '.join(map(str, array.ravel()[:3]))}"
+    return ""

@@ -197,13 +197,19 @@ def _worst_held(pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray | N
     """Images too many of whose matches contradict the block, where none of those that they are paired with is worse."""
     wrong, whole = Counter[str](), Counter[str]()
     for pair, mask in zip(pairs, masks, strict=True):
+        if mask is None:
+            continue
         for image_id in (pair.image_id0, pair.image_id1):
-            wrong[image_id] += 0 if mask is None else int(mask.sum())
-            whole[image_id] += 0 if mask is None else len(mask)
+            wrong[image_id] += int(mask.sum())
+            whole[image_id] += len(mask)
     share = {image_id: wrong[image_id] / count for image_id, count in whole.items() if count}
     bad = {image_id for image_id, value in share.items() if value > _MANY}
-    both = [(p.image_id0, p.image_id1) for p in pairs if {p.image_id0, p.image_id1} <= bad]
-    return bad - {min(ends, key=lambda image_id: (share[image_id], image_id)) for ends in both}
+    better = set()
+    for pair in pairs:
+        ends = pair.image_id0, pair.image_id1
+        if bad.issuperset(ends):
+            better.add(min(ends, key=lambda image_id: (share[image_id], image_id)))
+    return bad - better
 
 
 def _groups(block: AdjustedBlock) -> dict[str, int]:

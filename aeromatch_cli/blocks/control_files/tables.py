@@ -197,8 +197,12 @@ def read_marks(source: Source) -> Survey:
 
 def _first(source: Source) -> list[str]:
     """Values of the first line, of that below a CRS."""
-    first = next((_cells(record)[0] for line, record in source.records() if line > _line_of_code(source)), [])
-    return [] if _line_of_code(source) and len(first) != _POINT_VALUES else first  # gcp_list.txt
+    code = _line_of_code(source)
+    for line, record in source.records():
+        if line > code:
+            cells, _ = _cells(record)
+            return cells if not code or len(cells) == _POINT_VALUES else []  # others are those of gcp_list.txt
+    return []
 
 
 def _line_of_code(source: Source) -> int:
@@ -285,10 +289,13 @@ def _unnamed(source: Source, line: int, cells: list[str]) -> dict[str, str]:
     """Columns of a line of Pix4D's file, with a type where words stand behind the coordinates."""
     if len(cells) < 4:
         raise ConfigError(f"{source.at(line)}: {len(cells)} values, label and three coordinates are needed")
-    numbers = [cell for cell in cells[4:] if is_number(cell)]
-    words = [cell for cell in cells[4:] if cell and not is_number(cell)]
-    record = dict(zip(("label", "x", "y", "z"), cells, strict=False)) | {"type": words[0] if words else ""}
-    return record | (dict(zip(("sigma_xy", "sigma_z"), numbers, strict=False)) if len(numbers) == 2 else {})
+    label, x, y, z, *others = cells
+    numbers = [cell for cell in others if is_number(cell)]
+    words = [cell for cell in others if cell and not is_number(cell)]
+    record = {"label": label, "x": x, "y": y, "z": z, "type": words[0] if words else ""}
+    if len(numbers) == 2:
+        record["sigma_xy"], record["sigma_z"] = numbers
+    return record
 
 
 def _point(source: Source, line: int, record: Mapping[str, str], factors: Mapping[str, float]) -> SurveyedPoint:
