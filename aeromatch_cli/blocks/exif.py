@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import struct
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -419,25 +419,37 @@ def _sexagesimal(value: Any, reference: str, letters: str, largest: float) -> fl
 def _focal_lengths(exif: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float | None, float | None, str]:
     """Focal length and its 35-mm equivalent: of EXIF, else of XMP; where these state different ones, that which goes
     with the other of the two. And both in words, where they do."""
-    stated = [
-        [_positive(exif.get(tag)), _positive(xmp.get(name))]
-        for tag, name in ((_FOCAL_LENGTH, "exif:FocalLength"), (_FOCAL_LENGTH_35MM, "exif:FocalLengthIn35mmFilm"))
-    ]
-    lengths, equivalents = ([one for one in dict.fromkeys(both) if one or not any(both)] for both in stated)
-    fits = (
-        (own, equivalent)
-        for own in lengths
-        for equivalent in equivalents
-        if not (own and equivalent) or _CROP_FACTORS[0] < equivalent / own < _CROP_FACTORS[1]
-    )
-    used = next(fits, (lengths[0], equivalents[0]))
-    doubts = []
-    for what, (by_exif, by_xmp), one in zip(("focal length", "35-mm equivalent"), stated, used, strict=True):
-        if by_exif and by_xmp and not 1.0 / _SAME_LENGTH < by_exif / by_xmp < _SAME_LENGTH:
-            places = {"EXIF": by_exif, "XMP": by_xmp}
-            shown = sorted(places.items(), key=lambda place: place[1] == one)
-            doubts.append(f"{what} " + ", ".join(f"{mm:g} mm in {place}" for place, mm in shown))
-    return used[0], used[1], "; ".join(doubts)
+    lengths = _positive(exif.get(_FOCAL_LENGTH)), _positive(xmp.get("exif:FocalLength"))
+    equivalents = _positive(exif.get(_FOCAL_LENGTH_35MM)), _positive(xmp.get("exif:FocalLengthIn35mmFilm"))
+    length, equivalent = _that_go_together(_stated(lengths), _stated(equivalents))
+    doubts = [_doubt("focal length", lengths, length), _doubt("35-mm equivalent", equivalents, equivalent)]
+    return length, equivalent, "; ".join(doubt for doubt in doubts if doubt)
+
+
+def _stated(values: Sequence[float | None]) -> list[float | None]:
+    """Return the values that are stated, each once; [None] of none."""
+    return [value for value in dict.fromkeys(values) if value] or [None]
+
+
+def _that_go_together(
+    lengths: Sequence[float | None], equivalents: Sequence[float | None]
+) -> tuple[float | None, float | None]:
+    """Return the first focal length and 35-mm equivalent of one camera; the first ones where none go together."""
+    for length in lengths:
+        for equivalent in equivalents:
+            if not length or not equivalent or _CROP_FACTORS[0] < equivalent / length < _CROP_FACTORS[1]:
+                return length, equivalent
+    return lengths[0], equivalents[0]
+
+
+def _doubt(what: str, stated: tuple[float | None, float | None], used: float | None) -> str:
+    """Return both lengths of EXIF and XMP in words where they differ, that which is used last; else ""."""
+    by_exif, by_xmp = stated
+    if not by_exif or not by_xmp or 1.0 / _SAME_LENGTH < by_exif / by_xmp < _SAME_LENGTH:
+        return ""
+    places = {"EXIF": by_exif, "XMP": by_xmp}
+    shown = sorted(places.items(), key=lambda place: place[1] == used)
+    return f"{what} " + ", ".join(f"{mm:g} mm in {place}" for place, mm in shown)
 
 
 def _focal_plane(exif: Mapping[int, Any], width_px: int, height_px: int) -> tuple[float | None, bool]:

@@ -80,8 +80,10 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             rows.append(row)
             used_estimated += from_estimate
     words = ["estimated"] if used_estimated else []
-    words += ["/".join(angles)] if any(row.attitude for row in rows) else ["positions"]
-    remarks = [f"{source.path.name}: {disabled} cameras are not enabled there; they are used"] if disabled else []
+    words.append("/".join(angles) if any(row.attitude for row in rows) else "positions")
+    remarks = []
+    if disabled:
+        remarks.append(f"{source.path.name}: {disabled} cameras are not enabled there; they are used")
     if 0 < used_estimated < len(rows):
         remarks.append(
             f"{source.path.name}: {len(rows) - used_estimated} of {len(rows)} images have no estimated position there; "
@@ -204,6 +206,20 @@ def is_cameras_xml(source: Source) -> bool:
     return source.xml is not None and source.xml.tag == "document" and source.xml.find(".//camera") is not None
 
 
+def _in_world(matrix: FloatArray, placed: tuple[FloatArray, FloatArray, float]) -> tuple[FloatArray, FloatArray, bool]:
+    """Return centre (3,) and cam_from_world (3, 3) of a camera, and whether these are degrees and topocentric axes.
+
+    matrix: (4, 4) chunk_from_camera. placed: rotation, shift and scale from the chunk to the world.
+    """
+    turn, shift, scale = placed
+    center = scale * turn @ matrix[:3, 3] + shift
+    rotation = (turn @ matrix[:3, :3]).T
+    if not _EARTH_M[0] < float(np.linalg.norm(center)) < _EARTH_M[1]:
+        return center, rotation, False
+    center = geodetic(center[None])[0]
+    return center, rotation @ enu_from_geocentric(*center[:2]).T, True
+
+
 def read_cameras_xml(source: Source) -> PoseList:
     """Raises ConfigError naming the camera."""
     rows: list[PoseRow] = []
@@ -221,22 +237,12 @@ def read_cameras_xml(source: Source) -> PoseList:
                 unaligned += 1
                 continue
             matrix = _numbers(source, f"camera {label!r}", transform.text, 16).reshape(4, 4)
-            turn, shift, scale = parts.get(camera.get("component_id")) or whole or (np.eye(3), np.zeros(3), 1.0)
-            center = scale * turn @ matrix[:3, 3] + shift
-            world_from_camera = turn @ matrix[:3, :3]
-            earth = _EARTH_M[0] < float(np.linalg.norm(center)) < _EARTH_M[1]
+            placed = parts.get(camera.get("component_id")) or whole or (np.eye(3), np.zeros(3), 1.0)
+            center, rotation, earth = _in_world(matrix, placed)
             georeferenced.add(earth)
-            rotation = world_from_camera.T
-            if earth:
-                center = geodetic(center[None])[0]
-                rotation = rotation @ enu_from_geocentric(*center[:2]).T
-            sensor = f"sensor{camera.get('sensor_id')}"
-            rows.append(
-                rotation_row(
-                    label, len(rows) + 1, center, rotation, "geographic" if earth else "grid", true_north=earth,
-                    camera=cameras.key(sensor),
-                )
-            )  # fmt: skip
+            kind: PositionKind = "geographic" if earth else "grid"
+            lens = cameras.key(f"sensor{camera.get('sensor_id')}")
+            rows.append(rotation_row(label, len(rows) + 1, center, rotation, kind, true_north=earth, camera=lens))
     if len(georeferenced) > 1:
         raise ConfigError(f"{source.path}: some chunks are georeferenced and some are not: export one alone")
     if not rows:
@@ -244,7 +250,7 @@ def read_cameras_xml(source: Source) -> PoseList:
             f"{source.path}: no camera of this Metashape file is aligned: align the photos, or export the reference"
         )
     remarks = [f"{source.path.name}: {unaligned} cameras are not aligned there"] if unaligned else []
-    kind: PositionKind = "geographic" if georeferenced == {True} else "grid"
+    kind = "geographic" if georeferenced == {True} else "grid"
     words = "georeferenced" if kind == "geographic" else "not georeferenced"
     title = f"Metashape cameras.xml, {words}"
     return PoseList(tuple(rows), kind, (*remarks, *cameras.remarks), title, None, cameras.found)
