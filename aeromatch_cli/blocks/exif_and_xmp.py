@@ -41,27 +41,37 @@ Facts = dict[str, ExifFacts]
 
 def settled(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
     """Headers with the sounder of both statements as their position, and what is said of it. facts: by image name."""
-    found, remarks = dict(facts), []
-    both = [n for n, fact in found.items() if fact.latitude_deg is not None and fact.xmp_position[0] is not None]
-    if both:
-        exif_deg = np.array([[found[name].latitude_deg, found[name].longitude_deg] for name in both], dtype=float)
-        xmp_deg = np.array([found[name].xmp_position[:2] for name in both], dtype=float)
-        scale = _METRES_PER_DEGREE * np.array([1.0, math.cos(math.radians(float(np.median(exif_deg[:, 0]))))])
-        taken, remark = _sounder("positions", both, exif_deg * scale, xmp_deg * scale)
-        remarks += remark
-        for name, (latitude, longitude) in zip(both, xmp_deg, strict=True):
-            if name in taken:
-                found[name] = replace(found[name], latitude_deg=float(latitude), longitude_deg=float(longitude))
+    found, remarks = _sounder_positions(facts)
     found, said = consistent_altitudes(found)
     remarks += said
-    both = [n for n, fact in found.items() if fact.altitude_m is not None and fact.xmp_position[2] is not None]
-    if both:
-        exif_m = np.array([[found[name].altitude_m] for name in both], dtype=float)
-        xmp_m = np.array([[found[name].xmp_position[2]] for name in both], dtype=float)
-        taken, remark = _sounder("heights", both, exif_m, xmp_m)
-        remarks += remark
-        found |= {name: replace(found[name], altitude_m=found[name].xmp_position[2]) for name in taken}
+    found, said = _sounder_heights(found)
+    return found, remarks + said
+
+
+def _sounder_positions(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
+    """Return headers with the sounder of both latitudes and longitudes, and what is said of it."""
+    found = dict(facts)
+    both = [n for n, fact in found.items() if fact.latitude_deg is not None and fact.xmp_position[0] is not None]
+    if not both:
+        return found, []
+    exif_deg = np.array([[found[name].latitude_deg, found[name].longitude_deg] for name in both], dtype=float)
+    xmp_deg = np.array([found[name].xmp_position[:2] for name in both], dtype=float)
+    scale = _METRES_PER_DEGREE * np.array([1.0, math.cos(math.radians(float(np.median(exif_deg[:, 0]))))])
+    taken, remarks = _sounder("positions", both, exif_deg * scale, xmp_deg * scale)
+    for name, (latitude, longitude) in zip(both, xmp_deg, strict=True):
+        if name in taken:
+            found[name] = replace(found[name], latitude_deg=float(latitude), longitude_deg=float(longitude))
     return found, remarks
+
+
+def _sounder_heights(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
+    """Return headers with the sounder of both altitudes, and what is said of it."""
+    both = _with_both(facts)
+    if not both:
+        return dict(facts), []
+    altitudes_m = np.array(list(both.values()))
+    taken, remarks = _sounder("heights", list(both), altitudes_m[:, :1], altitudes_m[:, 1:])
+    return {**facts, **{name: replace(facts[name], altitude_m=both[name][1]) for name in taken}}, remarks
 
 
 def with_conventions(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:

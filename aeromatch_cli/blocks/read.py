@@ -369,29 +369,40 @@ def _nothing_left(images_dir: str, failures: list[ReadFailure], passed_over: lis
 
 
 def _assign_cameras(lists: GivenLists, facts: Mapping[str, ExifFacts], columns: Mapping[str, str]) -> CameraAssignment:
+    """Return the cameras of a camera file, else of the pose file, else of EXIF. columns: image -> camera as the pose
+    list names it."""
     stated = lists.pose_list.cameras if lists.pose_list is not None else {}
     if lists.camera_file is not None:
-        sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
-        own = lists.camera_file.cameras
-        # Cameras of the pose file give way, and so do their names.
-        known = {name: camera for name, camera in columns.items() if camera in own or camera not in stated}
-        remarks = lists.camera_file.remarks
-        named = sorted({camera for camera in known.values() if camera})
-        if named and not own.keys() & set(named):
-            # Of an earlier result, say: names that the program has given.
-            remarks = (*remarks, f"the camera file has none of the cameras that the pose list names ({listed(named)}): "
-                       "the names are not used")  # fmt: skip
-            known = {}
-        found = cameras_from_file(own, sizes_px, known)
-        return replace(found, warnings=(*remarks, *found.warnings))
-    stated = stated if lists.cameras == EXIF else {}
-    if stated:
+        return _cameras_of_file(lists.camera_file, stated, facts, columns)
+    if lists.cameras == EXIF and stated:
         return _cameras_of_poses(stated, facts, columns)
     groups = dict(columns)
     if lists.cameras == FOLDER:
-        groups = {name: columns.get(name) or str(PurePosixPath(name).parent) for name in facts}
-        groups = {name: "" if group == "." else group for name, group in groups.items()}
+        groups = {}
+        for name in facts:
+            group = columns.get(name) or str(PurePosixPath(name).parent)
+            groups[name] = "" if group == "." else group
     return cameras_from_exif(facts, groups)
+
+
+def _cameras_of_file(
+    camera_file: CameraFile,
+    stated: Mapping[str, Camera],
+    facts: Mapping[str, ExifFacts],
+    columns: Mapping[str, str],
+) -> CameraAssignment:
+    """Return the cameras of a camera file. stated: those of the pose file, which give way, and so do their names."""
+    sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
+    own, remarks = camera_file.cameras, camera_file.remarks
+    known = {name: camera for name, camera in columns.items() if camera in own or camera not in stated}
+    named = sorted({camera for camera in known.values() if camera})
+    if named and not own.keys() & set(named):
+        # Of an earlier result, say: names that the program has given.
+        remarks = (*remarks, f"the camera file has none of the cameras that the pose list names ({listed(named)}): "
+                   "the names are not used")  # fmt: skip
+        known = {}
+    found = cameras_from_file(own, sizes_px, known)
+    return replace(found, warnings=(*remarks, *found.warnings))
 
 
 def _cameras_of_poses(

@@ -207,6 +207,18 @@ def is_inpho(source: Source) -> bool:
     return "$PHOTO_FILE" in source.text and "$EXT_ORI" in source.text
 
 
+def _exterior_orientation(
+    source: Source, line: int, following: Sequence[tuple[int, str]]
+) -> tuple[Sequence[float], FloatArray]:
+    """Return the centre and the matrix (3, 3) of the lines behind $EXT_ORI, which stands in `line`."""
+    if len(following) < 4:
+        raise ConfigError(f"{source.at(line)}: four lines follow $EXT_ORI: focal length and centre, and a matrix")
+    (first, text), *others = following
+    matrix = [numbers(source.at(number), row.split(), ("value",) * 3) for number, row in others]
+    _, *center = numbers(source.at(first), text.split(), ("focal", "x", "y", "z"))
+    return center, np.array(matrix)
+
+
 def read_inpho(source: Source) -> PoseList:
     """Raises ConfigError with file and line."""
     turns = dict(_mounts(source.lines))
@@ -231,13 +243,8 @@ def read_inpho(source: Source) -> PoseList:
         elif key == "$CAMERA_ID":
             camera = value
         elif key == "$EXT_ORI":
-            if len(lines) < place + 5:
-                raise ConfigError(
-                    f"{source.at(line)}: four lines follow $EXT_ORI: focal length and centre, and a matrix"
-                )
-            following = [(n, numbers(source.at(n), t.split(), ("value",) * 3)) for n, t in lines[place + 2 : place + 5]]
-            center = numbers(source.at(lines[place + 1][0]), lines[place + 1][1].split(), ("focal", "x", "y", "z"))[1:]
-            photo_from_world = rotation_z(-turns.get(camera, 0.0)) @ np.array([values for _, values in following])
+            center, rotation = _exterior_orientation(source, line, lines[place + 1 : place + 5])
+            photo_from_world = rotation_z(-turns.get(camera, 0.0)) @ rotation
             at = system.position(source.at(line), *center)
             rows.append(rotation_row(name, line, at, CAM_FROM_PHOTO @ photo_from_world, system.kind))
         elif key == "$END":
