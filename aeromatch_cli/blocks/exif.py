@@ -158,10 +158,7 @@ def read_exif(path: Path) -> ExifFacts:
     # Some aircraft put the packet among the tags of a JPEG, too.
     packets = (*header.xmp, tags.get(_XMP_PACKET), exif.get(_XMP_PACKET))
     xmp = xmp_properties(dict.fromkeys(packet for packet in packets if packet), notes)
-    angles = xmp_angles(xmp)
-    if angles is None and _text(tags.get(_MAKE)) == "DJI":
-        angles = xmp_angles(dji_camera_angles(exif.get(_MAKER_NOTE)))
-        notes += ["no angles in XMP: those of DJI's maker notes are used"] if angles is not None else []
+    angles = _angles(tags, exif, xmp, notes)
     in_xmp = xmp_position(xmp)
     notes += unread_numbers(xmp)
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, in_xmp, has_signs(xmp), notes)
@@ -204,6 +201,19 @@ def read_exif(path: Path) -> ExifFacts:
         speed_m_s=xmp_speed_m_s(xmp),
         notes=tuple(notes),
     )
+
+
+def _angles(
+    tags: Mapping[int, Any], exif: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
+) -> CameraAngles | None:
+    """Return the angles that XMP states, else those of DJI's maker notes, which is noted."""
+    angles = xmp_angles(xmp)
+    if angles is not None or _text(tags.get(_MAKE)) != "DJI":
+        return angles
+    angles = xmp_angles(dji_camera_angles(exif.get(_MAKER_NOTE)))
+    if angles is not None:
+        notes.append("no angles in XMP: those of DJI's maker notes are used")
+    return angles
 
 
 def exif_or_reason(path: Path) -> ExifFacts | str:

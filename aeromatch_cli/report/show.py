@@ -354,17 +354,19 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     sides = [work.keypoints_px(i) for i in ids]
     points = match_points(kept, *sides) if kept is not None else (np.zeros((0, 2)), np.zeros((0, 2)))
     dropped = match_points(raw.matches, *sides) if rejected or kept is None else None
-    pixels = [read_pixels(work.picture(image), colour=True) for image in (image0, image1)]
     target = out or _own_file(workspace, f"{ids[0]}--{ids[1]}.png")
     words = f"green to yellow by error{', dropped ones red' if dropped is not None else ''}"
+    pixels = [read_pixels(work.picture(image), colour=True) for image in (image0, image1)]
     tiles = [Tile(f"matches: {words}", pair_picture(pixels, points, verdict.errors_px, dropped))]
-    if target.suffix.lower() != ".png":
-        laid, animated = aligned(pixels, points), target.suffix.lower() == ".gif"
-        if laid is None and animated:
-            raise InputError(f"{image0.name} and {image1.name} have too few matches to lay them on each other")
-        tiles += [laid] if laid is not None else []
-        words = tiles[-1].title if animated else f"{words}; {tiles[-1].title}"
-    write_tiles(target, tiles, lines, f"{image0.name} and {image1.name}")
+    kind, both = target.suffix.lower(), f"{image0.name} and {image1.name}"
+    laid = aligned(pixels, points) if kind != ".png" else None
+    if laid is not None:
+        tiles.append(laid)
+    elif kind == ".gif":
+        raise InputError(f"{both} have too few matches to lay them on each other")
+    write_tiles(target, tiles, lines, both)
+    if kind != ".png":
+        words = tiles[-1].title if kind == ".gif" else f"{words}; {tiles[-1].title}"
     lines.append(f"picture     {target}: {words}")
     facts = {"pair": [image0.name, image1.name], "verified": count, "state": verdict.state, "picture": str(target)}
     return Shown(lines, facts, target)

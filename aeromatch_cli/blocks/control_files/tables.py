@@ -77,6 +77,10 @@ _MARKS: Mapping[str, str] = {
 }  # fmt: skip
 
 
+# Line, and cells by column.
+_Record = tuple[int, Mapping[str, str]]
+
+
 def is_coordinates(source: Source) -> bool:
     """Whether a file is a table of points with three coordinates each."""
     if odm.is_gcp_line(next((record for _, record in source.records()), "")):
@@ -115,12 +119,11 @@ def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
     crs, crs_where = _stated_crs(source, said, geographic="latitude" in names)
     crs = crs or _crs_of_column(source, names, records)
     names, remarks = _one_form(source, names, crs)
-    remarks += tuple(
-        f"{source.path.name}: {words}" for words in (*more, *said.remarks, *(() if crs else said.not_whole))
-    )
-    rows = []
-    for line, cells, _ in records:
-        rows.append((line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells)))
+    not_applied = [*more, *said.remarks]
+    if not crs:
+        not_applied += said.not_whole
+    remarks += tuple(f"{source.path.name}: {words}" for words in not_applied)
+    rows = _named_records(names, records) if header else _unnamed_records(source, records)
     stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys((*"xyz", "sigma_xy", "sigma_z"), "")
     points = _points(source, rows, _factors(source, header, stated, said, crs or usual_crs, crs_where))
     geographic = "latitude" in names or _in_degrees(points)
@@ -134,6 +137,14 @@ def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
         crs = None  # of coordinates that the file does not have
     zero = zero_of(re.split(r"[\s_,;/.-]+", _cell_of_heights(source, header, names))) or said.zero
     return Survey(tuple(points), (), crs, crs_where, geographic, remarks, heights=zero)
+
+
+def _named_records(names: Sequence[str], records: Sequence[tuple[int, list[str], bool]]) -> list[_Record]:
+    return [(line, dict(zip(names, cells, strict=False))) for line, cells, _ in records]
+
+
+def _unnamed_records(source: Source, records: Sequence[tuple[int, list[str], bool]]) -> list[_Record]:
+    return [(line, _unnamed(source, line, cells)) for line, cells, _ in records]
 
 
 def _statements(
