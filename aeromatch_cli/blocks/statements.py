@@ -212,11 +212,13 @@ def _phrases(words: Sequence[str]) -> Iterator[list[_Item]]:
         parts = False
         if unit:
             before = words[place - 1] if place else ""
+            measured = before[:1].isdigit()
             circle = before in _CIRCLES and kind_of(unit) == "angle"
-            parts = other or (before[:1].isdigit() and not circle)
-            if other and _FLIGHT & set(words) and not before[:1].isdigit():
+            parts = other or (measured and not circle)
+            if other and not measured and _FLIGHT & set(words):
                 yield [("unit", unit)]
-            phrase += [] if parts else [("unit", unit)]
+            if not parts:
+                phrase.append(("unit", unit))
             other = False
         elif word in _QUANTITIES or is_named_datum(word):
             phrase.append(("what", _QUANTITIES.get(word, "heights")))

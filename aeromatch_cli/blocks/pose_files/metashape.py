@@ -178,7 +178,6 @@ def _row(
 
     (x, y, z), from_estimate = triple(("x", "y", "z"))
     attitude, _ = triple(angles)
-    whole = all(math.isfinite(v) for v in attitude)
     x_m, y_m, z_m, across_m, overall_m = (value(name) for name in _ACCURACIES)
     overall_m = overall_m if overall_m > 0.0 else value("accuracy")
     sigmas_m = completed_sigmas_m(x_m, y_m, z_m, across_m=across_m, overall_m=overall_m)
@@ -186,20 +185,24 @@ def _row(
     row = PoseRow(
         image=image_name(record.get("label", "")), line=line,
         position=system.position(source.at(line), x, y, z) if math.isfinite(x + y) else None,
-        position_kind=system.kind,
-        attitude=attitude if whole else None, attitude_kind="none" if not whole else "yaw_pitch_roll",
-        forward=False, true_north=angles[0] == "yaw",
-        sigmas_m=None if from_estimate else sigmas_m,
-        sigma_angle_deg=max(turns, default=None),
+        position_kind=system.kind, attitude=None, attitude_kind="none", forward=False, true_north=angles[0] == "yaw",
+        sigmas_m=None if from_estimate else sigmas_m, sigma_angle_deg=max(turns, default=None),
     )  # fmt: skip
-    if whole and angles == _ANGLES[1]:
-        return replace(row, attitude_kind="omega_phi_kappa", forward=None), from_estimate
-    if whole and angles == _ANGLES[2]:
-        phi, omega, kappa = attitude
-        photo = rotation_y(phi) @ rotation_x(omega) @ rotation_z(kappa)
-        turned = rotation_row(row.image, line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, system.kind)
-        return replace(row, attitude=turned.attitude, attitude_kind="quaternion", forward=None), from_estimate
-    return row, from_estimate
+    if not all(math.isfinite(v) for v in attitude):
+        return row, from_estimate
+    return _with_attitude(row, attitude, angles), from_estimate
+
+
+def _with_attitude(row: PoseRow, attitude: tuple[float, ...], angles: tuple[str, str, str]) -> PoseRow:
+    """Return a row with an attitude of three angles, degrees, by the names of these."""
+    if angles == _ANGLES[0]:
+        return replace(row, attitude=attitude, attitude_kind="yaw_pitch_roll")
+    if angles == _ANGLES[1]:
+        return replace(row, attitude=attitude, attitude_kind="omega_phi_kappa", forward=None)
+    phi, omega, kappa = attitude
+    photo = rotation_y(phi) @ rotation_x(omega) @ rotation_z(kappa)
+    turned = rotation_row(row.image, row.line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, row.position_kind)
+    return replace(row, attitude=turned.attitude, attitude_kind="quaternion", forward=None)
 
 
 def is_cameras_xml(source: Source) -> bool:
