@@ -244,8 +244,14 @@ def _chosen_images(
     unread = tuple(ReadFailure(one.name, one.reason) for one in passed_over if one.unread)
     warnings, failures = _report_scan(passed_over)
     warnings += remarks
-    failures += [ReadFailure(name, why) for name, why in headers.items() if isinstance(why, str) and name not in out]
-    facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str) and name not in out}
+    facts: dict[str, ExifFacts] = {}
+    for name, header in headers.items():
+        if name in out:
+            continue
+        if isinstance(header, str):
+            failures.append(ReadFailure(name, header))
+        else:
+            facts[name] = header
     panoramas, said = _panoramas(facts)
     warnings += said
     facts = {name: fact for name, fact in facts.items() if not fact.panorama}

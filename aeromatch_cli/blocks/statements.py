@@ -109,9 +109,13 @@ class Statements:
     def unit(self, kind: Kind, *quantities: Quantity) -> str:
         """The unit of the first of these that has one, "" for none. A unit of the other kind counts, so that it is
         refused, only where it is stated of the first quantity itself."""
-        found = (self.units[what, kind] for what in quantities if (what, kind) in self.units)
-        contrary = self.units.get((quantities[0], "angle" if kind == "length" else "length"), "")
-        return next(found, contrary if kind not in _KINDS[quantities[0]] or len(_KINDS[quantities[0]]) == 1 else "")
+        for what in quantities:
+            if (what, kind) in self.units:
+                return self.units[what, kind]
+        first = quantities[0]
+        if kind in _KINDS[first] and len(_KINDS[first]) > 1:
+            return ""
+        return self.units.get((first, "angle" if kind == "length" else "length"), "")
 
 
 def statements_of(lines: Iterable[str], mark: str = "#") -> Statements:
@@ -265,22 +269,25 @@ def _meant(items: Sequence[_Item]) -> Sequence[Quantity]:
 
 def _read_zero(found: Statements, comment: str, words: Sequence[str], *, heights: bool) -> None:
     """heights: whether the comment speaks of heights. A height above ground with its value is one of the flight."""
-    datum = names_datum(words) and (heights or any(map(is_named_datum, words)))
-    if datum and not found.datum:
-        found.datum = comment
-        found.zero = "" if {"geoid", "separation", "undulation"} & set(words) and not heights else zero_of(words)
-    if datum or not (heights or {"agl", "ato"} & set(words)):
+    if names_datum(words) and (heights or any(map(is_named_datum, words))):
+        if not found.datum:
+            of_geoid = bool({"geoid", "separation", "undulation"} & set(words))
+            found.datum = comment
+            found.zero = "" if of_geoid and not heights else zero_of(words)
+        return
+    if not heights and not {"agl", "ato"} & set(words):
         return
     number = next((place for place, word in enumerate(words) if word[:1].isdigit()), len(words))
     if number < len(words) and _QUANTITIES.get(words[0]) != "heights":
         return
-    if says_relative(words[:number]):
-        if _FLIGHT & set(words):
-            found.remarks.append(
-                f"{comment!r} speaks of heights above ground: if those of the list count so, leave them out"
-            )
-        elif not _OTHERS & set(words):
-            found.relative = found.relative or comment
+    if not says_relative(words[:number]):
+        return
+    if _FLIGHT & set(words):
+        found.remarks.append(
+            f"{comment!r} speaks of heights above ground: if those of the list count so, leave them out"
+        )
+    elif not _OTHERS & set(words):
+        found.relative = found.relative or comment
 
 
 def _read_north(found: Statements, comment: str, words: Sequence[str]) -> None:
