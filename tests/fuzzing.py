@@ -36,8 +36,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, Image, Matches, Pair, Pose, Verdict
 from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.files import read_json
-from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
-from aeromatch_cli.formats.dropped import read_dropped, write_dropped
+from aeromatch_cli.formats.adjusted import read_adjusted, read_dropped, write_adjusted, write_dropped
 from aeromatch_cli.formats.features import read_features, write_features
 from aeromatch_cli.formats.rows import (
     MatchEntry,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aeromatch_cli.blocks.altitudes import consistent_altitudes
 from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.blocks.exif_and_xmp import consistent_altitudes
 from aeromatch_cli.blocks.xmp import CameraAngles
 
 COUNT = 8

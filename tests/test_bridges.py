@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from aeromatch_cli.sfm.connectivity import probable_enough
+from aeromatch_cli.sfm.probability import probable_enough
 
 # Two flights, a b and c d, and two pairs between them.
 ENDS = [("a", "b"), ("c", "d"), ("a", "c"), ("b", "d")]

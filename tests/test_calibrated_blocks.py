@@ -15,9 +15,9 @@ from aeromatch_cli.blocks.cameras import FOCAL_SIGMAS
 from aeromatch_cli.data import AdjustedBlock, Camera, ControlPoint, FloatArray
 from aeromatch_cli.geometry.cameras import focal_px, project
 from aeromatch_cli.lab.synthetic.lenses import real_lens
+from aeromatch_cli.sfm.block_figures import residuals_of
 from aeromatch_cli.sfm.calibration import lens_of
 from aeromatch_cli.sfm.mapping import Group, adjust_block
-from aeromatch_cli.sfm.residuals import residuals_of
 from aeromatch_cli.sfm.shutter import at_once
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 

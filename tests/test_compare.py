@@ -10,7 +10,7 @@ from conftest import invoke
 
 from aeromatch_cli.data import Image
 from aeromatch_cli.report import compare as compared
-from aeromatch_cli.report.better import Standing, as_facts, criteria, verdict_lines
+from aeromatch_cli.report.compare import Standing, as_facts, criteria, verdict_lines
 
 SOUND = Standing("good", 12, 0.05, frozenset({"c1", "c2"}), 3, 50_000)
 

@@ -15,7 +15,7 @@ from test_control import adjusted_truth, cameras
 from test_export_colmap import Truth, make_truth
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, IntArray
-from aeromatch_cli.formats.dropped import read_dropped, write_dropped
+from aeromatch_cli.formats.adjusted import read_dropped, write_dropped
 from aeromatch_cli.geometry.cameras import project, world_rays
 from aeromatch_cli.geometry.epipolar import essential, relative_pose, triangulate
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aeromatch_cli.sfm.control_faults import fault_of_list
+from aeromatch_cli.sfm.control_adjustment import fault_of_list
 
 RNG = np.random.default_rng(3)
 TRUE_M = RNG.uniform([-120.0, -60.0, 5.0], [130.0, 90.0, 25.0], (6, 3))

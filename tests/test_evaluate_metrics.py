@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.evaluate.metrics import auc, coverage, pose_error_deg, thin
+from aeromatch_cli.evaluate.overlap import Texture, read_texture
 from aeromatch_cli.evaluate.scores import Conditions, PairScore, class_of
-from aeromatch_cli.evaluate.texture import Texture, read_texture
 from aeromatch_cli.evaluate.totals import PairRow, by_condition, total
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, rotation_y

@@ -12,7 +12,7 @@ from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.doubles import doubles, remarks_on
 from aeromatch_cli.blocks.exif import ExifFacts, read_exif
-from aeromatch_cli.blocks.ground_shots import ground_shots
+from aeromatch_cli.blocks.left_out import ground_shots
 
 COUNT = 20
 

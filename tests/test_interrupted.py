@@ -97,7 +97,7 @@ def test_sigterm_is_heard_while_pycolmap_is_loaded():
     code = (
         "import os, signal\n"
         "from aeromatch_cli.cli.output import _terminated_like_interrupt\n"
-        "from aeromatch_cli.strategies.exporters.colmap_model import import_pycolmap\n"
+        "from aeromatch_cli.strategies.exporters.colmap import import_pycolmap\n"
         "with _terminated_like_interrupt():\n"
         "    import_pycolmap()\n"
         "    try:\n"

@@ -15,7 +15,7 @@ from aeromatch_cli.strategies.matchers.descriptors import scan
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.matchers.descriptors.scan import Limits, mutual_nearest
-from aeromatch_cli.strategies.matchers.descriptors.views import comparable_views
+from aeromatch_cli.strategies.matchers.descriptors.search import comparable_views
 
 CAMERA = from_colmap("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0))
 GEOMETRY = PairGeometry(Pair("a", "b", 0.5, 0.0, "overlap"), CAMERA, CAMERA, None, None, None)

@@ -10,9 +10,9 @@ from aeromatch_cli.images.views import render_view
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 from aeromatch_cli.strategies.matchers.polar.affine import Windows
 from aeromatch_cli.strategies.matchers.polar.level import bilinear_at, level_of
+from aeromatch_cli.strategies.matchers.polar.points import searched
 from aeromatch_cli.strategies.matchers.polar.pyramid import Pyramid
 from aeromatch_cli.strategies.matchers.polar.registration import _EFFORTS, SCALES, Prior, register
-from aeromatch_cli.strategies.matchers.polar.relief import searched
 
 
 @pytest.mark.parametrize("effort", _EFFORTS)

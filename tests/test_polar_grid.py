@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeromatch_cli.geometry.polar import polar_grid
+from aeromatch_cli.strategies.matchers.polar.fit import polar_grid
 
 
 @settings(max_examples=25, deadline=None)

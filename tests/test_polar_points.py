@@ -12,7 +12,7 @@ from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.grid import Grid
 from aeromatch_cli.strategies.matchers.polar import Measured, Polar
-from aeromatch_cli.strategies.matchers.polar.relief import agreed
+from aeromatch_cli.strategies.matchers.polar.points import agreed
 from aeromatch_cli.strategies.simulators.none import source_view
 
 CAMERA = Camera("PINHOLE", 720, 540, (700.0, 700.0, 359.5, 269.5))

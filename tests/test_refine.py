@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import Camera, FloatArray, Pair, PairGeometry, Pose
 from aeromatch_cli.fingerprints import picture_fingerprint
-from aeromatch_cli.formats.features import read_keypoints
-from aeromatch_cli.formats.refined import checked_final_keypoints, read_final_keypoints
+from aeromatch_cli.formats.features import checked_final_keypoints, read_final_keypoints, read_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.geometry.level import level_affinities

@@ -10,10 +10,10 @@ import pytest
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, FloatArray, Image, Pose, PoseResidual
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.formats.residuals import read_residuals, residuals_text
+from aeromatch_cli.formats.adjusted import read_residuals, residuals_text
 from aeromatch_cli.geometry.cameras import from_colmap, project
 from aeromatch_cli.geometry.rotations import rotation_z
-from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
+from aeromatch_cli.sfm.block_figures import residual_figures, residuals_of
 
 CAMERA = from_colmap("SIMPLE_RADIAL", 1600, 1200, (1500.0, 800.0, 600.0, -0.03))
 STRAIGHT_DOWN = np.diag([1.0, -1.0, -1.0])

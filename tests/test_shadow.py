@@ -8,9 +8,14 @@ import pytest
 from aeromatch_cli.lab.synthetic import render_block
 from aeromatch_cli.nets.shadow import network_weights, shadow_logits
 from aeromatch_cli.strategies.enhancers.relight import relit
-from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
+from aeromatch_cli.strategies.enhancers.shadow import (
+    MAX_LISTED_REGIONS,
+    ShadowEnhancement,
+    find_regions,
+    gain_field,
+    region_table,
+)
 from aeromatch_cli.strategies.enhancers.shadow_mask import SoftMask, make_overview, shadow_share, soft_mask
-from aeromatch_cli.strategies.enhancers.shadow_regions import MAX_LISTED_REGIONS, find_regions, gain_field, region_table
 from aeromatch_cli.strategies.enhancers.tone import Tone
 
 SKY_SHARE = np.array([0.21, 0.25, 0.33])  # of sun and sky together: shadow is bluer

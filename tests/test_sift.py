@@ -9,8 +9,8 @@ from aeromatch_cli.data import Camera, View
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors import detection
 from aeromatch_cli.strategies.extractors.detection import root_sift
-from aeromatch_cli.strategies.extractors.merging import merge_keypoints
 from aeromatch_cli.strategies.extractors.reduction import factor_for
+from aeromatch_cli.strategies.extractors.selection import merge_keypoints
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.extractors.tiles import tiles
 

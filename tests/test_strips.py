@@ -8,7 +8,7 @@ import numpy as np
 
 from aeromatch_cli.data import Block, Camera, Image, Pose
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
-from aeromatch_cli.sfm.strip_attitudes import predicted
+from aeromatch_cli.sfm.pair_registration import predicted
 
 CAMERA = Camera("PINHOLE", 400, 300, (800.0, 800.0, 199.5, 149.5))
 

@@ -29,13 +29,23 @@ def completed_sigmas_m(
     stated of all (overall_m). A height of which nothing is stated has twice the horizontal standard deviation, an axis
     that is left has that of the others.
     """
-    stated = [value if value is not None and value > 0.0 else None for value in (x_m, y_m, z_m, across_m, overall_m)]
-    x, y, z, across, overall = stated
-    x, y, z = (own or general for own, general in ((x, across or overall), (y, across or overall), (z, overall)))
-    x, y = x or y, y or x
-    if x is None or y is None:
-        return None if z is None else (z, z, z)
-    return x, y, z or _HEIGHT_FACTOR * max(x, y)
+    across_m = _first_positive(across_m, overall_m)
+    x_m, y_m = _first_positive(x_m, across_m), _first_positive(y_m, across_m)
+    z_m = _first_positive(z_m, overall_m)
+    x_m, y_m = _first_positive(x_m, y_m), _first_positive(y_m, x_m)
+    if x_m is None or y_m is None:
+        return None if z_m is None else (z_m, z_m, z_m)
+    if z_m is None:
+        z_m = _HEIGHT_FACTOR * max(x_m, y_m)
+    return x_m, y_m, z_m
+
+
+def _first_positive(*values: float | None) -> float | None:
+    """Return the first of the values that is stated and positive, None without one."""
+    for value in values:
+        if value is not None and value > 0.0:
+            return value
+    return None
 
 
 def overall_sigma_m(sigmas_m: Sigmas) -> float:

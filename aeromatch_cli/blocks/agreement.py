@@ -49,9 +49,6 @@ def agreed(
         return found, []
     grid = found[names[0]].position_kind == "grid"
     if grid and crs in (AUTO, LOCAL, ""):
-        for order, words in ((gps, "lat and lon"), (gps[:, ::-1], "lon and lat")):
-            if _median_m(listed, order, np.full(2, _METRES_PER_DEG)) <= _SAME_M:
-                raise ConfigError(f"{source}: x and y are degrees, as the GPS of the images shows: name them {words}")
         return found, _zone_of_local(listed, gps, source)
     places = _grid_places(crs, gps) if grid else gps
     to_metres = np.ones(2) if grid else _METRES_PER_DEG * np.array([1.0, np.cos(np.deg2rad(np.median(gps[:, 0])))])
@@ -60,17 +57,24 @@ def agreed(
     if _median_m(listed, places, to_metres) <= _SAME_M:
         return found, _other_heights(found, facts, names, source)
     if _median_m(listed[:, ::-1], places, to_metres) <= _SAME_M:
-        for name, observation in observations.items():
-            first, second, height = observation.position
-            found[name] = replace(observation, position=(second, first, height))
         both = "x and y" if grid else "lat and lon"
-        return found, [f"{source}: {both} are exchanged, as the GPS of the images shows: they were put right"]
+        remark = f"{source}: {both} are exchanged, as the GPS of the images shows: they were put right"
+        return _exchanged(observations), [remark]
     away_km = _median_m(listed, places, to_metres) / 1000.0
     remark = f"{source} and the GPS of {len(names)} images are {away_km:,.1f} km apart"
     zone = _fitting_zone(listed, gps) if grid else None
     if zone:
         return found, [f"{remark}: x and y fit {zone}; give --crs {zone}"]
     return found, [f"{remark}: is it the list of another flight, or of another CRS?"]
+
+
+def _exchanged(observations: Mapping[str, Observation]) -> dict[str, Observation]:
+    """Return the observations with the first two coordinates exchanged."""
+    found = {}
+    for name, observation in observations.items():
+        first, second, height = observation.position
+        found[name] = replace(observation, position=(second, first, height))
+    return found
 
 
 def refuse_degrees(observations: Mapping[str, Observation], crs: str, source: str) -> None:
@@ -125,6 +129,11 @@ def _fitting_zone(listed: FloatArray, gps: FloatArray) -> str | None:
 
 
 def _zone_of_local(listed: FloatArray, gps: FloatArray, source: str) -> list[str]:
+    """Return a remark on x and y (N, 2) without a CRS that are those of a zone of UTM. Raises ConfigError where they
+    are degrees."""
+    for order, words in ((gps, "lat and lon"), (gps[:, ::-1], "lon and lat")):
+        if _median_m(listed, order, np.full(2, _METRES_PER_DEG)) <= _SAME_M:
+            raise ConfigError(f"{source}: x and y are degrees, as the GPS of the images shows: name them {words}")
     zone = _fitting_zone(listed, gps)
     return [f"{source}: by the GPS of the images, x and y are {zone}: give --crs {zone}"] if zone else []
 

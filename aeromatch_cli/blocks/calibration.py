@@ -72,9 +72,14 @@ def angle_sigma_deg(xmp: Mapping[str, str]) -> float | None:
 
 
 def _positive(xmp: Mapping[str, str], names: Sequence[str]) -> list[float]:
-    """All of these numbers; none where one is missing or not positive."""
-    found = [_numbers(xmp.get(name, "")) for name in names]
-    return [one[0] for one in found] if all(len(one) == 1 and one[0] > 0.0 for one in found) else []
+    """Return all of these numbers; none where one is missing or not positive."""
+    values = []
+    for name in names:
+        found = _numbers(xmp.get(name, ""))
+        if len(found) != 1 or not found[0] > 0.0:
+            return []
+        values.append(found[0])
+    return values
 
 
 def _of_dewarp(values: tuple[float, ...], width_px: int, height_px: int, dewarped: bool) -> Camera:

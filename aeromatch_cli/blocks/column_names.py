@@ -66,7 +66,9 @@ def words_of_height(cell: str) -> tuple[str, str]:
             unit.append(word)
         else:
             return "", ""
-    if len(words) > 8 or not (_HEIGHT | _DATUMS_ALONE) & set(name) or (unit and kind_of("".join(unit)) is None):
+    if len(words) > 8 or not (_HEIGHT | _DATUMS_ALONE) & set(name):
+        return "", ""
+    if unit and kind_of("".join(unit)) is None:
         return "", ""
     return "_".join(name), "".join(unit)
 
@@ -108,39 +110,47 @@ def on_side(where: str, degrees: float, found: str) -> float:
 def comments_of_columns(
     where: str, columns: Sequence[str], records: Iterable[Mapping[int, str]]
 ) -> tuple[list[str], tuple[int, ...], list[str]]:
-    """What columns of units (`altitude_unit`: ft), datums and zeros (`altitude_ref`: takeoff) say, as comments, the
-    places of these columns, and remarks.
+    """Return what columns of units (`altitude_unit`: ft), datums and zeros (`altitude_ref`: takeoff) say, as comments,
+    the places of these columns, and remarks.
 
     records: cells of every line by their place. Raises ConfigError where a column says several things.
     """
-    places = {}
+    quantities = _quantities(columns)
+    stated: dict[int, set[str]] = {place: set() for place in quantities}
+    for record in records if quantities else ():
+        for place, seen in stated.items():
+            cell = record.get(place, "").strip().lower()
+            if cell not in _BLANK:
+                seen.add(cell)
+    comments, taken, remarks = [], [], []
+    for place, quantity in quantities.items():
+        column, texts = columns[place], sorted(stated[place])
+        if len(texts) > 1:
+            raise ConfigError(f"{where}, column {column}: {texts[0]} and {texts[1]}: only one can be applied")
+        text = texts[0] if texts else ""
+        if quantity == "datum":
+            taken.append(place)
+            if text in ("1", "below sea level"):
+                remarks.append(f"column {column!r} says below sea level, which is not applied: write a minus")
+            elif text and text not in _USUAL_REFERENCES:
+                of_heights = re.search(r"alt|height|elev|vert|^z", column)
+                comments.append(f"# altitude reference: {text}" if of_heights else f"# Datum: {text}")
+        elif text and kind_of(text) is None:
+            remarks.append(f"column {column!r} names {text!r}, which is no unit that is known: not applied")
+        elif text:
+            taken.append(place)
+            if quantity or not is_usual(text):
+                comments.append(f"# {quantity} unit: {text}")
+    return comments, tuple(taken), remarks
+
+
+def _quantities(columns: Sequence[str]) -> dict[int, str]:
+    """Return place of a column -> of what it states units, in words; "datum" where it states what values count from."""
+    found = {}
     for place, name in enumerate(columns):
         match = _UNIT_COLUMN.fullmatch(name)
         if match and quantity_of(match[1] or "") is not None:
-            places[place] = (match[1] or "").replace("_", " ")
+            found[place] = (match[1] or "").replace("_", " ")
         elif _REFERENCE_COLUMN.fullmatch(name):
-            places[place] = "datum"
-    comments, taken, remarks = [], [], []
-    cells: dict[int, set[str]] = {place: set() for place in places}
-    for record in records if places else ():
-        for place in places:
-            text = record.get(place, "").strip().lower()
-            if text not in _BLANK:
-                cells[place].add(text)
-    for place, of in places.items():
-        units = sorted(cells[place])
-        if len(units) > 1:
-            raise ConfigError(f"{where}, column {columns[place]}: {units[0]} and {units[1]}: only one can be applied")
-        if of == "datum":
-            taken.append(place)
-            if units and units[0] in ("1", "below sea level"):
-                remarks.append(f"column {columns[place]!r} says below sea level, which is not applied: write a minus")
-            elif units and units[0] not in _USUAL_REFERENCES:
-                zero = re.search(r"alt|height|elev|vert|^z", columns[place])
-                comments.append(f"# altitude reference: {units[0]}" if zero else f"# Datum: {units[0]}")
-        elif units and kind_of(units[0]) is None:
-            remarks.append(f"column {columns[place]!r} names {units[0]!r}, which is no unit that is known: not applied")
-        elif units:
-            taken.append(place)
-            comments += [] if is_usual(units[0]) and not of else [f"# {of} unit: {units[0]}"]
-    return comments, tuple(taken), remarks
+            found[place] = "datum"
+    return found

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from aeromatch_cli.blocks.cameras import listed
-from aeromatch_cli.blocks.control_files import Mark, Survey, read_survey
+from aeromatch_cli.blocks.control_files import Mark, Survey, SurveyedPoint, read_survey
 from aeromatch_cli.blocks.crs import (
     AUTO,
     LOCAL,
@@ -80,11 +80,7 @@ def read_control(
         if not seen:
             unseen.append(point.name)
             continue
-        more: dict[str, Any] = {} if point.sigmas_m is None else {"sigmas_m": point.sigmas_m}
-        sigmas_px = [mark.sigma_px for _, mark in seen if mark.sigma_px is not None]
-        more |= {"sigma_px": float(np.median(sigmas_px))} if sigmas_px else {}
-        pixels = {image_id: np.array(mark.pixel) - COLMAP_OFFSET_PX for image_id, mark in seen}
-        points.append(ControlPoint(point.name, place_m, point.check or use == "check", pixels, **more))
+        points.append(_control_point(point, place_m, seen, check=point.check or use == "check"))
     if unseen:
         count = f"{len(unseen)} of {len(survey.points)} control points"
         remarks.append(f"{count} are measured in no image of the block: left out: {listed(unseen)}")
@@ -123,6 +119,21 @@ def _apart_m(places_m: FloatArray, poses: Mapping[str, Pose]) -> float | None:
     extent_m = float(np.linalg.norm(np.ptp(centers_m, axis=0)))
     apart_m = float(np.linalg.norm(np.median(places_m[:, :2], axis=0) - np.median(centers_m, axis=0)))
     return None if apart_m <= _FAR_EXTENTS * extent_m + _FAR_M else apart_m
+
+
+def _control_point(
+    point: SurveyedPoint, place_m: FloatArray, seen: Sequence[tuple[str, Mark]], *, check: bool
+) -> ControlPoint:
+    """Return a point at a place (3,) of the world with its measurements by image_id. What it does not state of
+    standard deviations is as usual."""
+    pixels = {image_id: np.array(mark.pixel) - COLMAP_OFFSET_PX for image_id, mark in seen}
+    sigmas: dict[str, Any] = {}
+    if point.sigmas_m is not None:
+        sigmas["sigmas_m"] = point.sigmas_m
+    sigmas_px = [mark.sigma_px for _, mark in seen if mark.sigma_px is not None]
+    if sigmas_px:
+        sigmas["sigma_px"] = float(np.median(sigmas_px))
+    return ControlPoint(point.name, place_m, check, pixels, **sigmas)
 
 
 def _places(
@@ -241,6 +252,17 @@ def _to_block(survey: Survey, stated: Any, crs: str, positions: FloatArray, *, s
     return places
 
 
+def _remarks_on_marks(path: Path, absent: Sequence[str], twice: list[str]) -> list[str]:
+    """Return what is said of measurements in images that the block does not have, and of repeated ones."""
+    remarks = []
+    if absent:
+        count = f"{len(absent)} image{'s' if len(absent) > 1 else ''}"
+        remarks.append(f"{path.name} names {count} that the block does not have: {listed(sorted(absent))}")
+    if twice:
+        remarks.append(f"{path.name} measures points twice in an image: the first counts: {listed(twice)}")
+    return remarks
+
+
 def _measured(
     marks: Sequence[Mark], path: Path, images: Sequence[Image]
 ) -> tuple[dict[str, list[tuple[str, Mark]]], list[str]]:
@@ -269,12 +291,7 @@ def _measured(
             turned += _inside(image, y, x)
         elif found[mark.point].setdefault(image.image_id, mark).pixel != mark.pixel:
             twice.append(words)
-    remarks = []
-    if absent:
-        count = f"{len(absent)} image{'s' if len(absent) > 1 else ''}"
-        remarks.append(f"{path.name} names {count} that the block does not have: {listed(sorted(absent))}")
-    if twice:
-        remarks.append(f"{path.name} measures points twice in an image: the first counts: {listed(twice)}")
+    remarks = _remarks_on_marks(path, absent, twice)
     if len(outside) > max(_FEW_OUTSIDE, _SHARE_OUTSIDE * sum(mark.image in known for mark in marks)):
         raise ConfigError(f"{path}: {_other_pictures(marks, known, by_name, outside, turned)}")
     if outside:

@@ -59,7 +59,7 @@ class CrsComment:
 
 
 def crs_comment(line: str) -> CrsComment | None:
-    """What a comment says of the CRS, None where it says nothing of one."""
+    """Return what a comment says of the CRS, None where it says nothing of one."""
     comment = line.strip()
     if not comment.startswith("#"):
         return None
@@ -69,23 +69,28 @@ def crs_comment(line: str) -> CrsComment | None:
         found = _labelled(comment, label["label"].lower(), label["mark"].strip(), label["text"].strip(" \t,;"))
         if found is not None:
             return found
-    for pattern in (_WKT, _PROJ):
-        match = pattern.search(body)
-        if match:
-            return CrsComment(match[0])
+    whole = _WKT.search(body) or _PROJ.search(body)
+    if whole:
+        return CrsComment(whole[0])
+    return _of_code(comment, body) or _of_words(comment, body)
+
+
+def _of_code(comment: str, body: str) -> CrsComment | None:
+    """Return the CRS whose code a comment names, None where it names none."""
     codes = list(_CODE.finditer(body))
-    if codes:
-        if len({code[2] for code in codes}) > 1 or _OF_OTHERS.search(body):
-            return CrsComment(
-                rest=body, unclear=f"{comment!r} does not say which CRS the list has: name it, # CRS: ..."
-            )
-        return CrsComment(_code(codes[0]), _without(body, codes[0]))
+    if not codes:
+        return None
+    if len({code[2] for code in codes}) > 1 or _OF_OTHERS.search(body):
+        return CrsComment(rest=body, unclear=f"{comment!r} does not say which CRS the list has: name it, # CRS: ...")
+    return CrsComment(_code(codes[0]), _without(body, codes[0]))
+
+
+def _of_words(comment: str, body: str) -> CrsComment | None:
+    """Return the CRS that a comment names by a zone of UTM, by its name or by its datum, None where it names none."""
     zone = _ZONE.search(body)
     if zone is not None and not _OF_OTHERS.search(body):
-        crs = _of_zone(body, zone)
-        if crs:
-            return CrsComment(crs, body[zone.end() :])
-        return CrsComment(rest=body[zone.end() :], unclear=_not_whole(comment))
+        crs, rest = _of_zone(body, zone), body[zone.end() :]
+        return CrsComment(crs, rest) if crs else CrsComment(rest=rest, unclear=_not_whole(comment))
     if _NAME.fullmatch(body) and _parses(body):
         return CrsComment(body)
     datum = _DATUM.search(body)
@@ -97,25 +102,20 @@ def crs_comment(line: str) -> CrsComment | None:
 
 
 def _labelled(comment: str, label: str, mark: str, text: str) -> CrsComment | None:
-    if is_datum(text) or (label == "datum" and names_datum(text.lower().split())):
-        return None  # of heights
-    if label == "datum" and text[:1].isdigit():
-        return None  # a date
-    code = _CODE.search(text)
-    datum = _DATUM.match(text)
-    zone = _ZONE.search(text)
+    """Return the CRS behind a label, None where the text is none of a CRS. mark: between both, "" for a blank."""
+    if _is_no_crs(label, text):
+        return None
+    code, datum = _CODE.search(text), _DATUM.match(text)
     if label in ("epsg", "srid") and re.fullmatch(r":?\s*\d{4,6}(\+\d{4,6})?", text):
         return CrsComment(f"EPSG:{text.strip(': ')}")
     if not mark and (code or label in _LOOSE or (label == "datum" and datum is None)):
         return None  # prose, in which a code counts as elsewhere
-    bare = text.strip("\"'")
-    for words in dict.fromkeys((bare, re.split(r"[,;]", bare)[0].strip())):
-        if _parses(words):
-            rest = bare[len(words) :]
-            alone = label in ("datum", *_OFTEN) and _DATUM.fullmatch(words) is not None
-            return _of_datum(comment, words, rest) if alone else CrsComment(words, rest)
+    parsed = _parsed_label(comment, label, text)
+    if parsed is not None:
+        return parsed
     if code:
         return CrsComment(_code(code), _without(text, code))
+    zone = _ZONE.search(text)
     if zone:
         crs = _of_zone(text, zone)
         return CrsComment(crs, text[zone.end() :]) if crs else CrsComment(text)
@@ -124,6 +124,24 @@ def _labelled(comment: str, label: str, mark: str, text: str) -> CrsComment | No
     if label == "datum":
         return CrsComment(rest=text, unclear=f"{comment!r} names no datum that is known: name a CRS, # CRS: EPSG:...")
     return CrsComment(text) if mark and label not in _OFTEN else None
+
+
+def _is_no_crs(label: str, text: str) -> bool:
+    """Whether the text behind a label is a datum of heights, or a date."""
+    if is_datum(text):
+        return True
+    return label == "datum" and (names_datum(text.lower().split()) or text[:1].isdigit())
+
+
+def _parsed_label(comment: str, label: str, text: str) -> CrsComment | None:
+    """Return the CRS that the text behind a label, or its first part, is the name of; None where it is none."""
+    bare = text.strip("\"'")
+    for words in dict.fromkeys((bare, re.split(r"[,;]", bare)[0].strip())):
+        if _parses(words):
+            rest = bare[len(words) :]
+            alone = label in ("datum", *_OFTEN) and _DATUM.fullmatch(words) is not None
+            return _of_datum(comment, words, rest) if alone else CrsComment(words, rest)
+    return None
 
 
 def _code(match: re.Match[str]) -> str:

@@ -1,4 +1,4 @@
-"""What an image file says of itself in its header: EXIF, GPS and XMP. Pixels are never decoded.
+"""What an image file says of itself in its header: EXIF, GPS, maker notes and XMP. Pixels are never decoded.
 
 What XMP says is read by `xmp` and `calibration`.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import struct
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -17,7 +17,6 @@ from typing import Any
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigmas_m
-from aeromatch_cli.blocks.maker_notes import dji_camera_angles
 from aeromatch_cli.blocks.packets import Packets, jp2_packets, jpeg_packets, png_packets
 from aeromatch_cli.blocks.xmp import (
     CameraAngles,
@@ -77,6 +76,9 @@ _CROP_FACTORS, _SAME_LENGTH = (0.4, 15.0), 1.25
 _TAKEN_NORTH_EAST = ": it counts as north and east; where that is wrong, write the letters (exiftool) or give --poses"
 # What Pillow raises on headers that are cut or scrambled.
 _BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, struct.error)
+# CameraPitch, CameraYaw and CameraRoll in DJI's maker notes, an IFD without a head. Source: ExifTool, DJI tags.
+_DJI_ANGLES = {"Yaw": 10, "Pitch": 9, "Roll": 11}
+_FLOAT, _ENTRY_BYTES = 11, 12
 
 
 @dataclass(frozen=True)
@@ -156,10 +158,7 @@ def read_exif(path: Path) -> ExifFacts:
     # Some aircraft put the packet among the tags of a JPEG, too.
     packets = (*header.xmp, tags.get(_XMP_PACKET), exif.get(_XMP_PACKET))
     xmp = xmp_properties(dict.fromkeys(packet for packet in packets if packet), notes)
-    angles = xmp_angles(xmp)
-    if angles is None and _text(tags.get(_MAKE)) == "DJI":
-        angles = xmp_angles(dji_camera_angles(exif.get(_MAKER_NOTE)))
-        notes += ["no angles in XMP: those of DJI's maker notes are used"] if angles is not None else []
+    angles = _angles(tags, exif, xmp, notes)
     in_xmp = xmp_position(xmp)
     notes += unread_numbers(xmp)
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, in_xmp, has_signs(xmp), notes)
@@ -202,6 +201,19 @@ def read_exif(path: Path) -> ExifFacts:
         speed_m_s=xmp_speed_m_s(xmp),
         notes=tuple(notes),
     )
+
+
+def _angles(
+    tags: Mapping[int, Any], exif: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
+) -> CameraAngles | None:
+    """Return the angles that XMP states, else those of DJI's maker notes, which is noted."""
+    angles = xmp_angles(xmp)
+    if angles is not None or _text(tags.get(_MAKE)) != "DJI":
+        return angles
+    angles = xmp_angles(dji_camera_angles(exif.get(_MAKER_NOTE)))
+    if angles is not None:
+        notes.append("no angles in XMP: those of DJI's maker notes are used")
+    return angles
 
 
 def exif_or_reason(path: Path) -> ExifFacts | str:
@@ -336,9 +348,13 @@ def _position(
 
 def _mirrored(own: tuple[float, float], others: tuple[float | None, float | None]) -> bool:
     """Whether two positions are the same but for signs."""
-    pairs = [(a, b) for a, b in zip(own, others, strict=True) if b is not None]
-    alike = all(abs(abs(a) - abs(b)) < _SAME_PLACE_DEG for a, b in pairs)
-    return len(pairs) == 2 and alike and any(abs(a - b) > _MIRRORED_DEG for a, b in pairs)
+    latitude, longitude = others
+    if latitude is None or longitude is None:
+        return False
+    pairs = (own[0], latitude), (own[1], longitude)
+    if not all(abs(abs(one) - abs(other)) < _SAME_PLACE_DEG for one, other in pairs):
+        return False
+    return any(abs(one - other) > _MIRRORED_DEG for one, other in pairs)
 
 
 def _exif_position(
@@ -413,25 +429,37 @@ def _sexagesimal(value: Any, reference: str, letters: str, largest: float) -> fl
 def _focal_lengths(exif: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float | None, float | None, str]:
     """Focal length and its 35-mm equivalent: of EXIF, else of XMP; where these state different ones, that which goes
     with the other of the two. And both in words, where they do."""
-    stated = [
-        [_positive(exif.get(tag)), _positive(xmp.get(name))]
-        for tag, name in ((_FOCAL_LENGTH, "exif:FocalLength"), (_FOCAL_LENGTH_35MM, "exif:FocalLengthIn35mmFilm"))
-    ]
-    lengths, equivalents = ([one for one in dict.fromkeys(both) if one or not any(both)] for both in stated)
-    fits = (
-        (own, equivalent)
-        for own in lengths
-        for equivalent in equivalents
-        if not (own and equivalent) or _CROP_FACTORS[0] < equivalent / own < _CROP_FACTORS[1]
-    )
-    used = next(fits, (lengths[0], equivalents[0]))
-    doubts = []
-    for what, (by_exif, by_xmp), one in zip(("focal length", "35-mm equivalent"), stated, used, strict=True):
-        if by_exif and by_xmp and not 1.0 / _SAME_LENGTH < by_exif / by_xmp < _SAME_LENGTH:
-            places = {"EXIF": by_exif, "XMP": by_xmp}
-            shown = sorted(places.items(), key=lambda place: place[1] == one)
-            doubts.append(f"{what} " + ", ".join(f"{mm:g} mm in {place}" for place, mm in shown))
-    return used[0], used[1], "; ".join(doubts)
+    lengths = _positive(exif.get(_FOCAL_LENGTH)), _positive(xmp.get("exif:FocalLength"))
+    equivalents = _positive(exif.get(_FOCAL_LENGTH_35MM)), _positive(xmp.get("exif:FocalLengthIn35mmFilm"))
+    length, equivalent = _that_go_together(_stated(lengths), _stated(equivalents))
+    doubts = [_doubt("focal length", lengths, length), _doubt("35-mm equivalent", equivalents, equivalent)]
+    return length, equivalent, "; ".join(doubt for doubt in doubts if doubt)
+
+
+def _stated(values: Sequence[float | None]) -> list[float | None]:
+    """Return the values that are stated, each once; [None] of none."""
+    return [value for value in dict.fromkeys(values) if value] or [None]
+
+
+def _that_go_together(
+    lengths: Sequence[float | None], equivalents: Sequence[float | None]
+) -> tuple[float | None, float | None]:
+    """Return the first focal length and 35-mm equivalent of one camera; the first ones where none go together."""
+    for length in lengths:
+        for equivalent in equivalents:
+            if not length or not equivalent or _CROP_FACTORS[0] < equivalent / length < _CROP_FACTORS[1]:
+                return length, equivalent
+    return lengths[0], equivalents[0]
+
+
+def _doubt(what: str, stated: tuple[float | None, float | None], used: float | None) -> str:
+    """Return both lengths of EXIF and XMP in words where they differ, that which is used last; else ""."""
+    by_exif, by_xmp = stated
+    if not by_exif or not by_xmp or 1.0 / _SAME_LENGTH < by_exif / by_xmp < _SAME_LENGTH:
+        return ""
+    places = {"EXIF": by_exif, "XMP": by_xmp}
+    shown = sorted(places.items(), key=lambda place: place[1] == used)
+    return f"{what} " + ", ".join(f"{mm:g} mm in {place}" for place, mm in shown)
 
 
 def _focal_plane(exif: Mapping[int, Any], width_px: int, height_px: int) -> tuple[float | None, bool]:
@@ -494,3 +522,21 @@ def _serial(value: Any) -> str:
 def _positive(value: Any) -> float | None:
     number = tag_number(value)
     return number if number is not None and number > 0 else None
+
+
+def dji_camera_angles(note: Any) -> dict[str, str]:
+    """Return the angles of the camera in DJI's maker notes, which remain where programs have dropped the XMP.
+
+    They stand under the names that XMP has for them, in degrees as there; none where one is missing.
+    """
+    if not isinstance(note, bytes):
+        return {}
+    for order in "<>":
+        found: dict[int, float] = {}
+        for start in range(2, len(note) - _ENTRY_BYTES + 1, _ENTRY_BYTES):
+            tag, kind, count, value = struct.unpack_from(f"{order}HHIf", note, start)
+            if kind == _FLOAT and count == 1:
+                found.setdefault(tag, value)
+        if found.keys() >= set(_DJI_ANGLES.values()):
+            return {f"drone-dji:Gimbal{name}Degree": f"{found[tag]:.2f}" for name, tag in _DJI_ANGLES.items()}
+    return {}

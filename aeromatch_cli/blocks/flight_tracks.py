@@ -90,7 +90,9 @@ def _place(block: str) -> tuple[float, float, float] | None:
 
 def _known(latitude: float, longitude: float, height_m: float) -> tuple[float, float, float] | None:
     """A place; None where there was no fix (0, 0), or it is none. A height that is none is NaN."""
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and (latitude or longitude)):
+    if latitude == 0.0 and longitude == 0.0:
+        return None
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
         return None
     return latitude, longitude, height_m if math.isfinite(height_m) else math.nan
 

@@ -28,7 +28,7 @@ _HEIGHTS = frozenset(("z", "alt", "altitude", "height", "elevation"))
 def with_coordinates(lines: Sequence[str]) -> list[str]:
     """Lines of a table with its column of points as columns lon, lat, alt or x, y, z, and crs where it states one;
     other lines as they are, and all of a table without such a column."""
-    header = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
+    header = next((k for k, line in enumerate(lines) if _is_plain(line)), None)
     if header is None or not any(name in lines[header].lower() for name in _NAMES):
         return list(lines)
     for separator in _SEPARATORS:
@@ -40,29 +40,58 @@ def with_coordinates(lines: Sequence[str]) -> list[str]:
 
 
 def _expanded(lines: Sequence[str], header: int, separator: str, column: int) -> list[str]:
-    plain = (k for k, line in enumerate(lines) if k >= header and line.strip() and not line.lstrip().startswith("#"))
-    records = {k: _cells(lines[k], separator) for k in plain}
+    """Return the lines of a table with its column of points as columns of coordinates."""
+    records = {k: _cells(lines[k], separator) for k in range(header, len(lines)) if _is_plain(lines[k])}
     points = {k: _POINT.fullmatch(cells[column]) for k, cells in records.items() if k > header and len(cells) > column}
     found = [point for point in points.values() if point is not None]
     if not found:
         return list(lines)
-    in_degrees = all(abs(float(point[k])) <= most for point in found for k, most in zip((2, 3), _DEGREES, strict=True))
-    own = ("lon", "lat", "alt") if in_degrees else ("x", "y", "z")
-    heights, stated = any(point[4] for point in found), any(point[1] for point in found)
-    new = [*own[: 3 if heights else 2], *(["crs"] if stated else [])]
+    heights = any(point[4] for point in found)
+    stated = any(point[1] for point in found)
     others = _COORDINATES | (_HEIGHTS if heights else frozenset())
     unread = {place for place, name in enumerate(records[header]) if _bare(name) in others} | {column}
+    values = {header: _new_columns(found, heights=heights, stated=stated)}
+    for k, point in points.items():
+        values[k] = _coordinates(point, heights=heights, stated=stated)
     out = list(lines)
-    for k, cells in records.items():
-        kept = [cell for place, cell in enumerate(cells) if place not in unread]
-        if k == header:
-            out[k] = _line([*kept, *new], separator)
-        elif k in points:
-            point = points[k]
-            x, y, height, crs = ("", "", "", "") if point is None else (point[2], point[3], point[4], point[1])
-            values = [x, y, *([height or ""] if heights else []), *([crs or ""] if stated else [])]
-            out[k] = _line([*kept, *values], separator)
+    for k, new in values.items():
+        kept = [cell for place, cell in enumerate(records[k]) if place not in unread]
+        out[k] = _line([*kept, *new], separator)
     return out
+
+
+def _new_columns(points: Sequence[re.Match[str]], *, heights: bool, stated: bool) -> list[str]:
+    """Return the names of the columns of coordinates. heights, stated: whether there are heights and CRSs."""
+    in_degrees = all(_is_in_degrees(point) for point in points)
+    names = ["lon", "lat"] if in_degrees else ["x", "y"]
+    if heights:
+        names.append("alt" if in_degrees else "z")
+    if stated:
+        names.append("crs")
+    return names
+
+
+def _is_plain(line: str) -> bool:
+    """Whether a line is neither empty nor a comment."""
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def _is_in_degrees(point: re.Match[str]) -> bool:
+    """Whether a point may be a longitude and a latitude."""
+    most_x, most_y = _DEGREES
+    return abs(float(point[2])) <= most_x and abs(float(point[3])) <= most_y
+
+
+def _coordinates(point: re.Match[str] | None, *, heights: bool, stated: bool) -> list[str]:
+    """Return the values of a point's columns, empty where it has none. heights, stated: whether there are columns of
+    heights and of CRSs."""
+    crs, x, y, height = ("", "", "", "") if point is None else point.groups(default="")
+    values = [x, y]
+    if heights:
+        values.append(height)
+    if stated:
+        values.append(crs)
+    return values
 
 
 def _bare(name: str) -> str:

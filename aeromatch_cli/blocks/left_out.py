@@ -1,15 +1,31 @@
-"""Images that the user leaves out: by name, by pattern, or by files with one of these in each line."""
+"""Images that are left out: those that the user names, and those that were taken on the ground.
+
+The user names images, patterns, or files with one of these in each line. On the ground, pictures of a reflectance panel
+are taken, and some before take-off or after landing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+import numpy as np
+
 from aeromatch_cli.blocks.cameras import listed
+from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.other_files import image_suffixes
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
+
+_PANEL = "show a reflectance panel by their XMP"
+_ON_GROUND = "were taken on the ground by their heights"
+_METRES_PER_DEGREE = 111_320.0
+# Those on the ground lie within so many metres of each other in height, and so far below all others.
+_LEVEL_M, _GAP_M = 3.0, 10.0
+# They lie at one place, are no more than this share of a block, and a block has so many images.
+_PLACE_M, _SHARE, _LEAST_IMAGES = 20.0, 0.2, 6
 
 
 def list_files(text: str) -> list[Path]:
@@ -57,3 +73,51 @@ def _lines(path: Path) -> list[str]:
         raise ConfigError(f"--exclude {path} cannot be read ({error}): give a text file of names") from error
     cells = (line.partition("#")[0].partition(",")[0].strip().strip("\"'") for line in text.splitlines())
     return [cell for cell in cells if cell]
+
+
+def ground_shots(facts: Mapping[str, ExifFacts]) -> dict[str, str]:
+    """Image name -> why it counts as taken on the ground, in words that go on "they". facts: by image name."""
+    found = {name: _PANEL for name, fact in facts.items() if fact.panel}
+    rest = {name: fact for name, fact in facts.items() if name not in found}
+    return found | dict.fromkeys(_standing(rest), _ON_GROUND)
+
+
+def remarks_on_ground_shots(shots: Mapping[str, str], total: int, *, dropped: bool) -> list[str]:
+    """Return one sentence for every reason that `ground_shots` has."""
+    remedy = "left out" if dropped else "leave them out with --set block.ground_shots=drop"
+    remarks = []
+    for reason in dict.fromkeys(shots.values()):
+        names = [name for name, one in shots.items() if one == reason]
+        remarks.append(f"{len(names)} of {total} images ({listed(names)}) {reason}: {remedy}")
+    return remarks
+
+
+def _standing(facts: Mapping[str, ExifFacts]) -> list[str]:
+    """Those that stand at the take-off point: where heights above it are known they are 0, else the lowest ones."""
+    above_takeoff = all(fact.relative_altitude_m is not None for fact in facts.values())
+    heights_m = {}
+    for name, fact in facts.items():
+        height_m = fact.relative_altitude_m if above_takeoff else fact.altitude_m
+        if height_m is not None:
+            heights_m[name] = height_m
+    if len(heights_m) < _LEAST_IMAGES:
+        return []
+    zero_m = 0.0 if above_takeoff else min(heights_m.values())
+    off_m = {name: abs(height_m - zero_m) for name, height_m in heights_m.items()}
+    low = [name for name, apart_m in off_m.items() if apart_m <= _LEVEL_M]
+    if not low or len(low) > _SHARE * len(heights_m):
+        return []
+    if min(apart_m for apart_m in off_m.values() if not apart_m <= _LEVEL_M) < _GAP_M:
+        return []
+    if above_takeoff or _at_one_place([facts[name] for name in low]):
+        return low
+    return []
+
+
+def _at_one_place(facts: list[ExifFacts]) -> bool:
+    places = np.array([[fact.latitude_deg, fact.longitude_deg] for fact in facts], dtype=float)
+    places = places[np.isfinite(places).all(axis=1)]
+    if len(places) == 0:
+        return False
+    places[:, 1] *= math.cos(math.radians(float(places[0, 0])))
+    return bool(np.linalg.norm(np.ptp(places, axis=0)) * _METRES_PER_DEGREE <= _PLACE_M)

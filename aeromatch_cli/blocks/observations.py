@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -14,12 +14,16 @@ from aeromatch_cli.blocks.crs import (
     WorldFrame,
     choose_crs,
     convergence_deg,
+    converted_heights,
     geographic_from_grid,
     grid_from_geographic,
+    heights_words,
+    outside_area,
     rounded_origin_m,
 )
 from aeromatch_cli.blocks.exif import ExifFacts
-from aeromatch_cli.blocks.poses import AttitudeKind, PoseRow, PositionKind
+from aeromatch_cli.blocks.pose_columns import AttitudeKind, PositionKind
+from aeromatch_cli.blocks.poses import PoseRow
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.angles import Angles
@@ -97,6 +101,11 @@ class Located(NamedTuple):
     level: Sequence[str]
     level_m: float
 
+    @property
+    def heights_from_flight(self) -> bool:
+        """Whether heights count from the flight: a ground that counts from elsewhere says nothing there."""
+        return bool(self.level) and len(self.level) == len(self.poses)
+
 
 def angles_of_exif(facts: ExifFacts, angles: AngleConvention) -> Angles | None:
     """Attitude that an image's header states, whether or not it states a position; yaw as it counts there."""
@@ -122,47 +131,123 @@ def oriented(
     poses keep their numbers. sigmas: where an observation states none. Raises ConfigError.
     """
     geographic = {name: o for name, o in observations.items() if o.position_kind == "geographic"}
-    latitudes = np.array([o.position[0] for o in geographic.values()])
-    longitudes = np.array([o.position[1] for o in geographic.values()])
-    automatic = crs.strip().lower() in ("", "auto") and stated_crs is None
-    code = (
-        known_frame.crs
-        if known_frame is not None and automatic and (known_frame.crs == LOCAL) == (not geographic)
-        else choose_crs(crs, stated_crs, latitudes.tolist(), longitudes.tolist())
-    )
+    degrees = np.array([o.position[:2] for o in geographic.values()]).reshape(-1, 2)
+    code = _code(crs, stated_crs, known_frame, degrees)
     grid = {name: np.array(o.position) for name, o in observations.items() if o.position_kind == "grid"}
     turns = _grid_turns(code, observations, grid)
     outside: list[str] = []
     if geographic:
-        xy_m = grid_from_geographic(code, latitudes, longitudes)
-        convergences = convergence_deg(code, latitudes, longitudes)
-        for row, (name, observation) in enumerate(geographic.items()):
-            if np.isfinite(xy_m[row]).all() and np.isfinite(convergences[row]):
-                grid[name] = np.array([*xy_m[row], observation.position[2]])
-                turns[name] = float(convergences[row])
-            else:
-                outside.append(name)
-        if len(outside) == len(geographic):
-            raise ConfigError(f"no position lies in the area of {code}: check --crs, and latitude against longitude")
+        projected, convergences, outside = _projected(code, geographic, degrees)
+        grid |= projected
+        turns |= convergences
     zeros = _grid_zeros(code, grid)
     grid = {name: center_m for name, center_m in grid.items() if name not in zeros}
     grid, level_m, level = _with_heights(grid)
     frame = WorldFrame(code, _origin_m(code, list(grid.values()), known_frame))
-    stated = {name: _angles(observations[name], turns[name]) for name in grid}
-    angles = {name: one for name, one in stated.items() if one is not None}
-    poses = {}
+    angles, poses = dict[str, Angles](), dict[str, Pose]()
     for name, center_m in grid.items():
-        sigmas_m = _sigmas_m(observations[name], sigma_position_m)
+        observation = observations[name]
+        stated = _angles(observation, turns[name])
+        if stated is not None:
+            angles[name] = stated
+        sigmas_m = _sigmas_m(observation, sigma_position_m)
         poses[name] = Pose(
             center_m=center_m - np.array(frame.origin_m),
-            world_rotation=angles[name].rotation if name in angles else None,
+            world_rotation=None if stated is None else stated.rotation,
             sigma_position_m=overall_sigma_m(sigmas_m),
-            sigma_angle_deg=observations[name].sigma_angle_deg or sigma_angle_deg,
+            sigma_angle_deg=observation.sigma_angle_deg or sigma_angle_deg,
             sigmas_m=sigmas_m if len(set(sigmas_m)) > 1 else None,
         )
     unusable = {f"lie outside the area of {code}": outside, "have the position (0, 0)": zeros}
     faults = {words: names for words, names in unusable.items() if names}
     return Located(frame, poses, angles, faults, level, level_m)
+
+
+def in_world_heights(
+    located: Located, stated: str, wanted: str, crs: str, shift_m: float
+) -> tuple[Located, str, list[str]]:
+    """Return positions whose heights count from where the CRS says, what that is, "" for unknown, and remarks.
+
+    stated, wanted: what heights count from, as of `crs.heights_of`: as something states it, and by the CRS that the
+    user gave (crs); "" for unknown. shift_m: is added to the heights.
+    """
+    if located.heights_from_flight or not located.poses or located.frame.crs == LOCAL:
+        return located, "", []
+    origin_m = np.array(located.frame.origin_m)
+    places_m = np.array([pose.center_m for pose in located.poses.values()]) + origin_m
+    heights_m, own, remarks = _transformed(places_m, stated, wanted, located.frame.crs, crs)
+    if shift_m:
+        heights_m = heights_m + shift_m
+        remarks.append(f"heights of positions are shifted by {shift_m:+g} m, as block.height_shift_m asks")
+        own = wanted
+    poses = {
+        name: replace(pose, center_m=np.array([*pose.center_m[:2], height_m - origin_m[2]]))
+        for (name, pose), height_m in zip(located.poses.items(), heights_m, strict=True)
+    }
+    return located._replace(poses=poses), own, remarks
+
+
+def _transformed(
+    places_m: FloatArray, stated: str, wanted: str, code: str, crs: str
+) -> tuple[FloatArray, str, list[str]]:
+    """Return the heights (N,) of places (N, 3) in a CRS (code), what they count from, and remarks; transformed where
+    that is known and not what is wanted. crs: as the user gave it."""
+    if wanted and not stated:
+        remark = (
+            f"--crs {crs} names {heights_words(wanted)}, and nothing states what heights of positions count from: they "
+            "stay as they are; --set block.heights=ellipsoid has them transformed"
+        )
+        return places_m[:, 2], stated, [remark]
+    if not wanted or stated == wanted:
+        return places_m[:, 2], stated, []
+    heights_m, why_not = converted_heights(code, stated, wanted, places_m)
+    if why_not:
+        remark = f"positions: {why_not}; --set block.height_shift_m=METRES shifts them by a known height"
+        return heights_m, stated, [remark]
+    by_m = float(np.median(heights_m - places_m[:, 2]))
+    words = f"from {heights_words(stated)} to {heights_words(wanted)}"
+    return heights_m, wanted, [f"heights of positions are transformed {words}: {by_m:+.2f} m (median)"]
+
+
+def foreign_crs(located: Located) -> list[str]:
+    """Return what is said of a CRS that is used elsewhere."""
+    origin_m = np.array(located.frame.origin_m[:2])
+    places_m = np.array([pose.center_m[:2] for pose in located.poses.values()]).reshape(-1, 2) + origin_m
+    remark = outside_area(located.frame.crs, places_m)
+    return [remark] if remark else []
+
+
+def _code(crs: str, stated_crs: str | None, known_frame: WorldFrame | None, degrees: FloatArray) -> str:
+    """Return the CRS of the world: that of an earlier run where nothing names one and it suits, else as `choose_crs`.
+
+    degrees: latitudes and longitudes (N, 2) of the positions that have such.
+    """
+    automatic = crs.strip().lower() in ("", "auto") and stated_crs is None
+    if known_frame is not None and automatic and (known_frame.crs == LOCAL) == (not len(degrees)):
+        return known_frame.crs
+    return choose_crs(crs, stated_crs, degrees[:, 0].tolist(), degrees[:, 1].tolist())
+
+
+def _projected(
+    code: str, geographic: Mapping[str, Observation], degrees: FloatArray
+) -> tuple[dict[str, FloatArray], dict[str, float], list[str]]:
+    """Return centres (3,) in the grid of a CRS, meridian convergences in degrees, and names of positions outside.
+
+    degrees: (N, 2) latitudes and longitudes of the observations. Raises ConfigError where all lie outside.
+    """
+    latitudes, longitudes = degrees[:, 0], degrees[:, 1]
+    xy_m = grid_from_geographic(code, latitudes, longitudes)
+    convergences = convergence_deg(code, latitudes, longitudes)
+    grid, turns, outside = dict[str, FloatArray](), dict[str, float](), list[str]()
+    for row, (name, observation) in enumerate(geographic.items()):
+        if np.isfinite(xy_m[row]).all() and np.isfinite(convergences[row]):
+            grid[name] = np.array([*xy_m[row], observation.position[2]])
+            turns[name] = float(convergences[row])
+        else:
+            outside.append(name)
+    if len(outside) == len(geographic):
+        raise ConfigError(f"no position lies in the area of {code}: check --crs, and latitude against longitude")
+    return grid, turns, outside
 
 
 def _sigmas_m(observation: Observation, usual_m: float) -> Sigmas:

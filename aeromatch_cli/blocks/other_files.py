@@ -83,8 +83,11 @@ def masks_by_content(folder: Path, names: Iterable[str]) -> set[str]:
     likely: list[str] = []
     for same in twins(names):
         small = [name for name in same if name.lower().endswith(_LOSSLESS) and compresses_like_a_mask(folder / name)]
-        likely += small if len(small) < len(same) else []
-    return set(likely) if all(is_black_and_white(folder / name) for name in likely[:_DECODED]) else set()
+        if len(small) < len(same):
+            likely += small
+    if all(is_black_and_white(folder / name) for name in likely[:_DECODED]):
+        return set(likely)
+    return set()
 
 
 def unread_kind(name: str) -> str:

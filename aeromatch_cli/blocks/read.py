@@ -30,22 +30,20 @@ from aeromatch_cli.blocks.crs import (
     WorldFrame,
     checked_crs,
     checked_heights,
-    converted_heights,
     heights_of,
-    heights_words,
-    outside_area,
 )
 from aeromatch_cli.blocks.doubles import in_two_formats, thumbnails
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.exif_and_xmp import settled, with_conventions
-from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
 from aeromatch_cli.blocks.image_names import matched_rows
-from aeromatch_cli.blocks.left_out import excluded
+from aeromatch_cli.blocks.left_out import excluded, ground_shots, remarks_on_ground_shots
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
     Located,
     Observation,
     angles_of_exif,
+    foreign_crs,
+    in_world_heights,
     observation_of_exif,
     observation_of_row,
     oriented,
@@ -174,26 +172,10 @@ def block_inputs(
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
-    out, remarks = excluded(exclude, [*headers, *(one.name for one in passed_over if one.unread)])
-    passed_over = [one for one in passed_over if one.name not in out]
-    unread = tuple(ReadFailure(one.name, one.reason) for one in passed_over if one.unread)
-    warnings, failures = _report_scan(passed_over)
+    chosen = _chosen_images(headers, passed_over, exclude, drop_ground_shots=drop_ground_shots)
+    facts, warnings, failures = chosen.facts, [*chosen.warnings], [*chosen.failures]
+    rows, remarks = _rows_of_images(lists, list(headers), facts)
     warnings += remarks
-    failures += [ReadFailure(name, why) for name, why in headers.items() if isinstance(why, str) and name not in out]
-    facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str) and name not in out}
-    panoramas, said = _panoramas(facts)
-    unread += panoramas
-    warnings += said
-    facts = {name: fact for name, fact in facts.items() if not fact.panorama}
-    shots = ground_shots(facts)
-    warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
-    if drop_ground_shots:
-        facts = {name: fact for name, fact in facts.items() if name not in shots}
-    rows: dict[str, PoseRow] = {}
-    if lists.pose_list is not None:
-        times = {name: fact.time for name, fact in facts.items()}
-        rows, remarks = matched_rows(lists.pose_list, list(headers), f"pose list {lists.poses}", times)
-        warnings += [*lists.pose_list.warnings, *remarks]
     assignment = _assign_cameras(lists, facts, {name: row.camera for name, row in rows.items()})
     warnings += assignment.warnings
     failures += [ReadFailure(name, reason) for name, reason in assignment.reasons.items()]
@@ -201,31 +183,18 @@ def block_inputs(
     if not facts:
         raise InputError(_nothing_left(images_dir, failures, warnings))
 
-    warnings += _rasters(facts)
-    facts, remarks = settled(facts)
-    warnings += remarks if lists.poses == EXIF else []
-    sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
-    warnings += [*in_two_formats(sizes_px), *thumbnails(sizes_px)]
-    facts, remarks = with_conventions(facts)
-    warnings += remarks if lists.poses == EXIF and lists.angles == "auto" else []
+    facts, remarks = _consistent_headers(lists, facts)
+    warnings += remarks
     observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
-    camera_file = lists.camera_file
-    likely_focals, remarks = contradicting_exif(assignment, facts) if camera_file is not None else ({}, [])
+    with_file = lists.camera_file is not None
+    likely_focals, remarks = contradicting_exif(assignment, facts) if with_file else ({}, [])
     warnings += remarks
-    stated_crs = _stated_crs(lists, crs)
-    observations, remarks = _agreeing(lists, observations, facts, stated_crs if crs == AUTO and stated_crs else crs)
+    sigmas = sigma_position_m, sigma_angle_deg
+    located, heights, remarks = _located(lists, observations, facts, crs, known_frame, sigmas, given_heights)
     warnings += remarks
-    located = oriented(observations, crs, stated_crs, known_frame, sigma_position_m, sigma_angle_deg)
-    located, heights, remarks = _in_world_heights(located, lists, crs, given_heights)
-    warnings += remarks
-    frame, named_poses, angles = located.frame, located.poses, located.angles
-    warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
-    warnings += _level_flight(located, facts)
-    warnings += _foreign_crs(located)
-    stated = None if _all_level(located) else _stated_ground(camera_file, frame, Path(lists.cameras).name)
-    hint_z_m, hint_source = stated or _relative_ground({} if _all_level(located) else named_poses, facts)
-    angles |= _angles_alone(lists, facts, angles)
+    ground = _ground_hint(lists, located, facts)
+    angles = located.angles | _angles_alone(lists, facts, located.angles)
     ids = image_ids(facts)
     images = _images(ids, facts, assignment.camera_ids)
     captures = captures_of(images, facts, located.poses, located.frame)
@@ -233,23 +202,136 @@ def block_inputs(
     return BlockInputs(
         images=images,
         cameras=assignment.cameras,
-        poses={ids[name]: pose for name, pose in named_poses.items()},
+        poses={ids[name]: pose for name, pose in located.poses.items()},
         angles={ids[name]: one for name, one in angles.items()},
-        crs=frame.crs,
-        origin_m=frame.origin_m,
-        ground_hint_z_m=hint_z_m,
-        ground_hint_source=hint_source,
-        ground_is_stated=stated is not None,
+        crs=located.frame.crs,
+        origin_m=located.frame.origin_m,
+        ground_hint_z_m=ground.z_m,
+        ground_hint_source=ground.source,
+        ground_is_stated=ground.is_stated,
         focal_sigmas=assignment.focal_sigmas,
         likely_focals=likely_focals,
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
-        unread=unread,
+        unread=chosen.unread,
         recognised=_recognised(lists, rows, headers, assignment.by_pose_file),
         flights=flight_of,
         velocities=velocities(captures, flight_of),
         heights=heights,
     )
+
+
+class _ChosenImages(NamedTuple):
+    """The images that a block has. facts: their headers, by name. unread, failures: what is left out, and why."""
+
+    facts: dict[str, ExifFacts]
+    unread: tuple[ReadFailure, ...]
+    failures: list[ReadFailure]
+    warnings: list[str]
+
+
+def _chosen_images(
+    headers: Mapping[str, ExifFacts | str],
+    passed_over: Sequence[ScanFailure],
+    exclude: str,
+    *,
+    drop_ground_shots: bool,
+) -> _ChosenImages:
+    """Return the images that the user does not leave out and whose headers are usable, without panoramas and, where
+    asked for, without pictures that were taken on the ground."""
+    out, remarks = excluded(exclude, [*headers, *(one.name for one in passed_over if one.unread)])
+    passed_over = [one for one in passed_over if one.name not in out]
+    unread = tuple(ReadFailure(one.name, one.reason) for one in passed_over if one.unread)
+    warnings, failures = _report_scan(passed_over)
+    warnings += remarks
+    facts: dict[str, ExifFacts] = {}
+    for name, header in headers.items():
+        if name in out:
+            continue
+        if isinstance(header, str):
+            failures.append(ReadFailure(name, header))
+        else:
+            facts[name] = header
+    panoramas, said = _panoramas(facts)
+    warnings += said
+    facts = {name: fact for name, fact in facts.items() if not fact.panorama}
+    shots = ground_shots(facts)
+    warnings += remarks_on_ground_shots(shots, len(facts), dropped=drop_ground_shots)
+    if drop_ground_shots:
+        facts = {name: fact for name, fact in facts.items() if name not in shots}
+    return _ChosenImages(facts, unread + panoramas, failures, warnings)
+
+
+def _rows_of_images(
+    lists: GivenLists, names: Sequence[str], facts: Mapping[str, ExifFacts]
+) -> tuple[dict[str, PoseRow], list[str]]:
+    """Return image name -> its line of the pose list, and remarks of the list; nothing without a list."""
+    if lists.pose_list is None:
+        return {}, []
+    times = {name: fact.time for name, fact in facts.items()}
+    rows, remarks = matched_rows(lists.pose_list, names, f"pose list {lists.poses}", times)
+    return rows, [*lists.pose_list.warnings, *remarks]
+
+
+def _consistent_headers(lists: GivenLists, facts: dict[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
+    """Return headers without the contradictions that a block as a whole shows, and remarks.
+
+    Of positions and angles they are said only where these come from the headers.
+    """
+    warnings = _rasters(facts)
+    facts, remarks = settled(facts)
+    warnings += remarks if lists.poses == EXIF else []
+    sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
+    warnings += [*in_two_formats(sizes_px), *thumbnails(sizes_px)]
+    facts, remarks = with_conventions(facts)
+    warnings += remarks if lists.poses == EXIF and lists.angles == "auto" else []
+    return facts, warnings
+
+
+def _located(
+    lists: GivenLists,
+    observations: dict[str, Observation],
+    facts: Mapping[str, ExifFacts],
+    crs: str,
+    known_frame: WorldFrame | None,
+    sigmas: tuple[float, float],
+    given_heights: GivenHeights,
+) -> tuple[Located, str, list[str]]:
+    """Return the observations in the world frame, what its heights count from, and remarks.
+
+    crs, known_frame, given_heights: as of `block_inputs`. sigmas: of a position in metres and of an attitude in degrees
+    that states none.
+    """
+    stated_crs = _stated_crs(lists, crs)
+    observations, warnings = _agreeing(lists, observations, facts, stated_crs if crs == AUTO and stated_crs else crs)
+    located = oriented(observations, crs, stated_crs, known_frame, *sigmas)
+    wanted = heights_of(crs) if crs.strip().lower() not in ("", AUTO, LOCAL) else ""
+    stated = _stated_heights(lists, wanted, given_heights)
+    located, heights, remarks = in_world_heights(located, stated, wanted, crs, given_heights.shift_m)
+    warnings += remarks
+    warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
+    warnings += _level_flight(located, facts)
+    warnings += foreign_crs(located)
+    return located, heights, warnings
+
+
+class _GroundHint(NamedTuple):
+    """World height of the ground as the input states it, None for unknown; source: where it comes from, in words."""
+
+    z_m: float | None
+    source: str
+    is_stated: bool
+
+
+def _ground_hint(lists: GivenLists, located: Located, facts: Mapping[str, ExifFacts]) -> _GroundHint:
+    """Return the ground that the camera file states, else that below the relative altitudes; none where heights count
+    from the flight."""
+    if located.heights_from_flight:
+        return _GroundHint(None, "", is_stated=False)
+    stated = _stated_ground(lists.camera_file, located.frame, Path(lists.cameras).name)
+    if stated is not None:
+        return _GroundHint(*stated, is_stated=True)
+    return _GroundHint(*_relative_ground(located.poses, facts), is_stated=False)
 
 
 def _recognised(lists: GivenLists, rows: Mapping[str, PoseRow], headers: Mapping[str, object], with_camera: int) -> str:
@@ -293,29 +375,40 @@ def _nothing_left(images_dir: str, failures: list[ReadFailure], passed_over: lis
 
 
 def _assign_cameras(lists: GivenLists, facts: Mapping[str, ExifFacts], columns: Mapping[str, str]) -> CameraAssignment:
+    """Return the cameras of a camera file, else of the pose file, else of EXIF. columns: image -> camera as the pose
+    list names it."""
     stated = lists.pose_list.cameras if lists.pose_list is not None else {}
     if lists.camera_file is not None:
-        sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
-        own = lists.camera_file.cameras
-        # Cameras of the pose file give way, and so do their names.
-        known = {name: camera for name, camera in columns.items() if camera in own or camera not in stated}
-        remarks = lists.camera_file.remarks
-        named = sorted({camera for camera in known.values() if camera})
-        if named and not own.keys() & set(named):
-            # Of an earlier result, say: names that the program has given.
-            remarks = (*remarks, f"the camera file has none of the cameras that the pose list names ({listed(named)}): "
-                       "the names are not used")  # fmt: skip
-            known = {}
-        found = cameras_from_file(own, sizes_px, known)
-        return replace(found, warnings=(*remarks, *found.warnings))
-    stated = stated if lists.cameras == EXIF else {}
-    if stated:
+        return _cameras_of_file(lists.camera_file, stated, facts, columns)
+    if lists.cameras == EXIF and stated:
         return _cameras_of_poses(stated, facts, columns)
     groups = dict(columns)
     if lists.cameras == FOLDER:
-        groups = {name: columns.get(name) or str(PurePosixPath(name).parent) for name in facts}
-        groups = {name: "" if group == "." else group for name, group in groups.items()}
+        groups = {}
+        for name in facts:
+            group = columns.get(name) or str(PurePosixPath(name).parent)
+            groups[name] = "" if group == "." else group
     return cameras_from_exif(facts, groups)
+
+
+def _cameras_of_file(
+    camera_file: CameraFile,
+    stated: Mapping[str, Camera],
+    facts: Mapping[str, ExifFacts],
+    columns: Mapping[str, str],
+) -> CameraAssignment:
+    """Return the cameras of a camera file. stated: those of the pose file, which give way, and so do their names."""
+    sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
+    own, remarks = camera_file.cameras, camera_file.remarks
+    known = {name: camera for name, camera in columns.items() if camera in own or camera not in stated}
+    named = sorted({camera for camera in known.values() if camera})
+    if named and not own.keys() & set(named):
+        # Of an earlier result, say: names that the program has given.
+        remarks = (*remarks, f"the camera file has none of the cameras that the pose list names ({listed(named)}): "
+                   "the names are not used")  # fmt: skip
+        known = {}
+    found = cameras_from_file(own, sizes_px, known)
+    return replace(found, warnings=(*remarks, *found.warnings))
 
 
 def _cameras_of_poses(
@@ -429,70 +522,25 @@ def _with_exif_heights(
     return observations, [remark] if heights_m else []
 
 
-def _all_level(located: Located) -> bool:
-    """Whether heights count from the flight: a ground that counts from elsewhere says nothing there."""
-    return bool(located.level) and len(located.level) == len(located.poses)
-
-
-def _in_world_heights(
-    located: Located, lists: GivenLists, crs: str, given: GivenHeights
-) -> tuple[Located, str, list[str]]:
-    """Positions whose heights count from where the CRS says, what that is, "" for unknown, and remarks.
-
-    crs: as the user gave it: of it are positions in a grid of which nothing else is stated, heights included.
-    """
-    wanted = heights_of(crs) if crs.strip().lower() not in ("", AUTO, LOCAL) else ""
-    stated = lists.pose_list.heights if lists.pose_list is not None else ""
-    if not stated and lists.pose_list is not None and lists.pose_list.position_kind == "grid":
-        stated = wanted
-    own = checked_heights(given.zero) if given.zero.strip().lower() != AUTO else stated
-    if _all_level(located) or not located.poses or located.frame.crs == LOCAL:
-        return located, "", []
-    origin_m = np.array(located.frame.origin_m)
-    places_m = np.array([pose.center_m for pose in located.poses.values()]) + origin_m
-    heights_m, remarks = places_m[:, 2], list[str]()
-    if wanted and own and own != wanted:
-        heights_m, why_not = converted_heights(located.frame.crs, own, wanted, places_m)
-        if why_not:
-            remarks.append(f"positions: {why_not}; --set block.height_shift_m=METRES shifts them by a known height")
-        else:
-            by_m = float(np.median(heights_m - places_m[:, 2]))
-            words = f"from {heights_words(own)} to {heights_words(wanted)}"
-            remarks.append(f"heights of positions are transformed {words}: {by_m:+.2f} m (median)")
-            own = wanted
-    elif wanted and not own:
-        remarks.append(
-            f"--crs {crs} names {heights_words(wanted)}, and nothing states what heights of positions count from: they "
-            "stay as they are; --set block.heights=ellipsoid has them transformed"
-        )
-    if given.shift_m:
-        heights_m = heights_m + given.shift_m
-        remarks.append(f"heights of positions are shifted by {given.shift_m:+g} m, as block.height_shift_m asks")
-        own = wanted
-    poses = {
-        name: replace(pose, center_m=np.array([*pose.center_m[:2], height_m - origin_m[2]]))
-        for (name, pose), height_m in zip(located.poses.items(), heights_m, strict=True)
-    }
-    return located._replace(poses=poses), own, remarks
-
-
-def _foreign_crs(located: Located) -> list[str]:
-    """What is said of a CRS that is used elsewhere."""
-    origin = np.array(located.frame.origin_m[:2])
-    places = np.array([pose.center_m[:2] for pose in located.poses.values()]).reshape(-1, 2) + origin
-    remark = outside_area(located.frame.crs, places)
-    return [remark] if remark else []
+def _stated_heights(lists: GivenLists, wanted: str, given: GivenHeights) -> str:
+    """Return what heights of positions count from, as of `crs.heights_of`, "" for unknown: as the user says, else the
+    pose list; of a list in a grid that states nothing else, as the CRS says that the user gave (wanted)."""
+    if given.zero.strip().lower() != AUTO:
+        return checked_heights(given.zero)
+    if lists.pose_list is None:
+        return ""
+    if lists.pose_list.position_kind == "grid":
+        return lists.pose_list.heights or wanted
+    return lists.pose_list.heights
 
 
 def _level_flight(located: Located, facts: Mapping[str, ExifFacts]) -> list[str]:
-    """What is said of images without a height."""
+    """Return what is said of images without a height."""
     if not located.level:
         return []
-    zero = (
-        "0 m, so that heights count from the flight"
-        if _all_level(located)
-        else f"{located.level_m:.1f} m, that of the others"
-    )
+    zero = f"{located.level_m:.1f} m, that of the others"
+    if located.heights_from_flight:
+        zero = "0 m, so that heights count from the flight"
     return [f"{_count(located.level, facts)} have a position without height: a level flight at {zero}, is assumed"]
 
 

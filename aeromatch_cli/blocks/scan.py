@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,38 +71,55 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
 
     passed_over = {os.path.realpath(path) for path in exclude} - {os.path.realpath(folder)}
     files_passed_over = {path for path in passed_over if Path(path).is_file()}
-    visited, suffixes = set(passed_over), image_suffixes()
+    visited = set(passed_over)
     for parent, subfolders, files in os.walk(folder, onerror=unreadable, followlinks=True):
         real = os.path.realpath(parent)
-        if real in visited:  # excluded, or a link that leads back up
+        is_workspace = parent != str(folder) and {"block.json", "images.csv", "pairs.csv"} <= set(files)
+        if real in visited or is_workspace:  # visited: excluded, or a link that leads back up
             subfolders.clear()
             continue
         visited.add(real)
-        if parent != str(folder) and {"block.json", "images.csv", "pairs.csv"} <= set(files):  # a workspace
-            subfolders.clear()
-            continue
         subfolders[:] = sorted(name for name in subfolders if not name.startswith(".") and name != _THUMBNAILS)
-        for name in subfolders:
-            if Path(name).suffix.lower() in suffixes:
-                relative = (Path(parent) / name).relative_to(folder).as_posix()
-                failures.append(ScanFailure(relative, "is a folder with the name of an image", False))
-        for name in files:
-            path = Path(parent) / name
-            relative = path.relative_to(folder).as_posix()
-            if Path(name).suffix.lower() not in suffixes:
-                failures += _unread(relative, path)
-                continue
-            if files_passed_over and os.path.realpath(path) in files_passed_over:
-                continue
-            failure = _failure_of(path, relative)
-            if failure is not None:
-                failures.append(failure)
-            elif not name.startswith("."):
-                names.append(relative)
+        failures += _folders_like_images(folder, Path(parent), subfolders)
+        found, unfit = _scan_paths(folder, [Path(parent) / name for name in files], files_passed_over)
+        names += found
+        failures += unfit
     kept, failures = _sorted_out(names, failures)
     masks = masks_by_content(folder, kept)
     failures += [ScanFailure(name, MASK, False) for name in sorted(masks)]
     return [name for name in kept if name not in masks], sorted(failures, key=lambda failure: failure.name)
+
+
+def _is_image(path: Path) -> bool:
+    """Whether a path has the suffix of an image that is read."""
+    return path.suffix.lower() in image_suffixes()
+
+
+def _folders_like_images(folder: Path, parent: Path, subfolders: Sequence[str]) -> Iterator[ScanFailure]:
+    for name in subfolders:
+        if _is_image(Path(name)):
+            relative = (parent / name).relative_to(folder).as_posix()
+            yield ScanFailure(relative, "is a folder with the name of an image", False)
+
+
+def _scan_paths(folder: Path, paths: Sequence[Path], passed_over: Set[str]) -> tuple[list[str], list[ScanFailure]]:
+    """Return the relative names of those files that are images, and what is said of the others.
+
+    passed_over: real paths of images that are not searched for.
+    """
+    names: list[str] = []
+    failures: list[ScanFailure] = []
+    for path in paths:
+        relative = path.relative_to(folder).as_posix()
+        if not _is_image(path):
+            failures += _unread(relative, path)
+        elif passed_over and os.path.realpath(path) in passed_over:
+            continue
+        elif (failure := _failure_of(path, relative)) is not None:
+            failures.append(failure)
+        elif not path.name.startswith("."):
+            names.append(relative)
+    return names, failures
 
 
 def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[ScanFailure]]:

@@ -27,7 +27,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.crs import LOCAL, WorldFrame, convergence_deg, geographic_from_grid
 from aeromatch_cli.blocks.exif import ExifFacts
-from aeromatch_cli.data import FloatArray, Image, Pose
+from aeromatch_cli.data import BoolArray, FloatArray, Image, Pose
 
 _DAY_S = 86400.0
 # What is longer than this, and than so many usual intervals, is a landing: nobody changes a battery in less. Aircraft
@@ -113,9 +113,14 @@ def _world_from_ned(poses: Mapping[str, Pose], frame: WorldFrame) -> FloatArray 
 
 def flights(captures: Iterable[Capture]) -> dict[str, str]:
     """image_id -> name of its flight, "flight 1" being the first; of all images."""
-    found = [part for group in _by_aircraft(captures) for part in _of_aircraft(group)]
-    found.sort(key=lambda part: (min(_time_s(one) for one in part), _place(part[0])))
-    return {one.image_id: f"flight {number}" for number, part in enumerate(found, start=1) for one in part}
+    parts = []
+    for group in _by_aircraft(captures):
+        parts += _of_aircraft(group)
+    parts.sort(key=lambda part: (min(map(_time_s, part)), _place(part[0])))
+    names: dict[str, str] = {}
+    for number, part in enumerate(parts, start=1):
+        names |= dict.fromkeys([one.image_id for one in part], f"flight {number}")
+    return names
 
 
 def velocities(captures: Iterable[Capture], flight_of: Mapping[str, str]) -> dict[str, FloatArray]:
@@ -149,7 +154,7 @@ def _by_aircraft(captures: Iterable[Capture]) -> list[list[Capture]]:
 
 def _of_aircraft(group: Sequence[Capture]) -> list[list[Capture]]:
     timed = sorted((one for one in group if one.time_s is not None), key=lambda one: (_time_s(one), _place(one)))
-    parts = [part for piece in _cut(timed, _landings(timed)) for part in _cut(piece, _moved_takeoffs(piece))]
+    parts = _flown_apart(timed, _landings(timed))
     number = {one.image_id: row for row, part in enumerate(parts) for one in part}
     rest: list[Capture] = []
     for series in _series(group):
@@ -162,7 +167,15 @@ def _of_aircraft(group: Sequence[Capture]) -> list[list[Capture]]:
             elif one.image_id not in number:
                 parts[latest].append(one)
     for series in _series(rest):
-        parts += [part for piece in _cut(series, _gaps(series)) for part in _cut(piece, _moved_takeoffs(piece))]
+        parts += _flown_apart(series, _gaps(series))
+    return parts
+
+
+def _flown_apart(sequence: Sequence[Capture], starts: Iterable[int]) -> list[list[Capture]]:
+    """Return the parts of a sequence that begin at the given places, or where the take-off point has moved."""
+    parts = []
+    for piece in _cut(sequence, starts):
+        parts += _cut(piece, _moved_takeoffs(piece))
     return parts
 
 
@@ -252,33 +265,46 @@ def _time_s(one: Capture) -> float:
 
 
 def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
-    """Velocities of images on straight lines, by the images before and after them on the same line."""
+    """Return the velocities of images on straight lines, by the images before and after them on the same line."""
     track = sorted((one for one in group if one.time_s is not None and one.center_m is not None), key=_time_s)
     if len(track) < 3:
         return {}
     times_s = np.array([_time_s(one) for one in track])
     centers_m = np.array([one.center_m for one in track])
-    gaps_s, ways_m = np.diff(times_s), np.diff(centers_m, axis=0)
-    if not (gaps_s > 0.0).any():
+    if not (np.diff(times_s) > 0.0).any():
         return {}
-    lengths_m = np.hypot(ways_m[:, 0], ways_m[:, 1])
-    near = (gaps_s > 0.0) & (gaps_s <= _NEAR_INTERVALS * np.median(gaps_s[gaps_s > 0.0])) & (lengths_m > 0.0)
-    along = (ways_m[1:, :2] * ways_m[:-1, :2]).sum(axis=1)
-    ahead = along >= math.cos(math.radians(_TURN_DEG)) * lengths_m[1:] * lengths_m[:-1]
-    on = np.concatenate([[False], near[1:] & near[:-1] & ahead, [False]])  # at an image the line goes on
-    beside = np.concatenate([[False], near[:-1]]) | np.concatenate([near[1:], [False]])
-    flown = near & (on[:-1] | on[1:] | ~beside)  # from image to image: not on the way to another line
+    on, flown = _lines_of_track(times_s, centers_m)
     reach = _REACH if (times_s % 1.0).any() else _REACH_WHOLE_SECONDS
     found = {}
     for row in range(len(track)):
-        first = last = row
-        while first > 0 and flown[first - 1] and (on[first] or first == row) and row - first < reach:
-            first -= 1
-        while last < len(flown) and flown[last] and (on[last] or last == row) and last - row < reach:
-            last += 1
+        first, last = _ends_of_line(row, on, flown, reach)
         if first == last or (first < row < last and not on[row]):  # at a corner two lines meet
             continue
         velocity = (centers_m[last] - centers_m[first]) / (times_s[last] - times_s[first])
         if np.linalg.norm(velocity) <= _FASTEST_M_S:
             found[track[row].image_id] = velocity
     return found
+
+
+def _ends_of_line(row: int, on: BoolArray, flown: BoolArray, reach: int) -> tuple[int, int]:
+    """Return the first and the last image on the line of an image, `reach` places away at most. on, flown: as of
+    `_lines_of_track`."""
+    first = last = row
+    while first > 0 and flown[first - 1] and (on[first] or first == row) and row - first < reach:
+        first -= 1
+    while last < len(flown) and flown[last] and (on[last] or last == row) and last - row < reach:
+        last += 1
+    return first, last
+
+
+def _lines_of_track(times_s: FloatArray, centers_m: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Return at which images (N,) of a track a line goes on, and which ways (N - 1,) from image to image are flown on
+    a line, not on the way to another one. times_s (N,) ascending, two of them apart; centers_m (N, 3)."""
+    gaps_s, ways_m = np.diff(times_s), np.diff(centers_m, axis=0)
+    lengths_m = np.hypot(ways_m[:, 0], ways_m[:, 1])
+    near = (gaps_s > 0.0) & (gaps_s <= _NEAR_INTERVALS * np.median(gaps_s[gaps_s > 0.0])) & (lengths_m > 0.0)
+    along = (ways_m[1:, :2] * ways_m[:-1, :2]).sum(axis=1)
+    ahead = along >= math.cos(math.radians(_TURN_DEG)) * lengths_m[1:] * lengths_m[:-1]
+    on = np.concatenate([[False], near[1:] & near[:-1] & ahead, [False]])
+    beside = np.concatenate([[False], near[:-1]]) | np.concatenate([near[1:], [False]])
+    return on, near & (on[:-1] | on[1:] | ~beside)

@@ -109,9 +109,13 @@ class Statements:
     def unit(self, kind: Kind, *quantities: Quantity) -> str:
         """The unit of the first of these that has one, "" for none. A unit of the other kind counts, so that it is
         refused, only where it is stated of the first quantity itself."""
-        found = (self.units[what, kind] for what in quantities if (what, kind) in self.units)
-        contrary = self.units.get((quantities[0], "angle" if kind == "length" else "length"), "")
-        return next(found, contrary if kind not in _KINDS[quantities[0]] or len(_KINDS[quantities[0]]) == 1 else "")
+        for what in quantities:
+            if (what, kind) in self.units:
+                return self.units[what, kind]
+        first = quantities[0]
+        if kind in _KINDS[first] and len(_KINDS[first]) > 1:
+            return ""
+        return self.units.get((first, "angle" if kind == "length" else "length"), "")
 
 
 def statements_of(lines: Iterable[str], mark: str = "#") -> Statements:
@@ -133,9 +137,11 @@ def statements_of(lines: Iterable[str], mark: str = "#") -> Statements:
 
 
 def quantity_of(words: str) -> Quantity | None:
-    """What a column of units is of, by its words; None for something else."""
+    """Return what a column of units is of, by its words; None for something else."""
     found = [_QUANTITIES.get(word) for word in words.split("_") if word]
-    return (found[0] if found else "all") if None not in found else None
+    if None in found:
+        return None
+    return found[0] if found else "all"
 
 
 def _names_columns(text: str) -> bool:
@@ -210,11 +216,13 @@ def _phrases(words: Sequence[str]) -> Iterator[list[_Item]]:
         parts = False
         if unit:
             before = words[place - 1] if place else ""
+            measured = before[:1].isdigit()
             circle = before in _CIRCLES and kind_of(unit) == "angle"
-            parts = other or (before[:1].isdigit() and not circle)
-            if other and _FLIGHT & set(words) and not before[:1].isdigit():
+            parts = other or (measured and not circle)
+            if other and not measured and _FLIGHT & set(words):
                 yield [("unit", unit)]
-            phrase += [] if parts else [("unit", unit)]
+            if not parts:
+                phrase.append(("unit", unit))
             other = False
         elif word in _QUANTITIES or is_named_datum(word):
             phrase.append(("what", _QUANTITIES.get(word, "heights")))
@@ -232,13 +240,16 @@ def _phrases(words: Sequence[str]) -> Iterator[list[_Item]]:
 
 
 def _unit_at(words: Sequence[str], place: int) -> tuple[str, int]:
-    """The unit that begins at a word, and of how many words it is; "", 0 for none."""
-    for count in (4, 3, 2, 1) if words[place] != "m" else (1,):
+    """Return the unit that begins at a word, and of how many words it is; "", 0 for none."""
+    most = 1 if words[place] == "m" else min(4, len(words) - place)
+    for count in range(most, 0, -1):
         text = "".join(words[place : place + count])
-        if len(words) >= place + count and kind_of(text) and (len(text) > 1 or text in ("m", "°")) and text != "cc":
-            foreign = words[place - 1] if place and words[place - 1] in _FOREIGN else ""
-            return f"{foreign} {text}".strip() if foreign else text, count
-    return ("", 0)
+        if not kind_of(text) or text == "cc" or (len(text) == 1 and text not in ("m", "°")):
+            continue
+        if place and words[place - 1] in _FOREIGN:
+            return f"{words[place - 1]} {text}", count
+        return text, count
+    return "", 0
 
 
 def _meant(items: Sequence[_Item]) -> Sequence[Quantity]:
@@ -258,22 +269,25 @@ def _meant(items: Sequence[_Item]) -> Sequence[Quantity]:
 
 def _read_zero(found: Statements, comment: str, words: Sequence[str], *, heights: bool) -> None:
     """heights: whether the comment speaks of heights. A height above ground with its value is one of the flight."""
-    datum = names_datum(words) and (heights or any(map(is_named_datum, words)))
-    if datum and not found.datum:
-        found.datum = comment
-        found.zero = "" if {"geoid", "separation", "undulation"} & set(words) and not heights else zero_of(words)
-    if datum or not (heights or {"agl", "ato"} & set(words)):
+    if names_datum(words) and (heights or any(map(is_named_datum, words))):
+        if not found.datum:
+            of_geoid = bool({"geoid", "separation", "undulation"} & set(words))
+            found.datum = comment
+            found.zero = "" if of_geoid and not heights else zero_of(words)
+        return
+    if not heights and not {"agl", "ato"} & set(words):
         return
     number = next((place for place, word in enumerate(words) if word[:1].isdigit()), len(words))
     if number < len(words) and _QUANTITIES.get(words[0]) != "heights":
         return
-    if says_relative(words[:number]):
-        if _FLIGHT & set(words):
-            found.remarks.append(
-                f"{comment!r} speaks of heights above ground: if those of the list count so, leave them out"
-            )
-        elif not _OTHERS & set(words):
-            found.relative = found.relative or comment
+    if not says_relative(words[:number]):
+        return
+    if _FLIGHT & set(words):
+        found.remarks.append(
+            f"{comment!r} speaks of heights above ground: if those of the list count so, leave them out"
+        )
+    elif not _OTHERS & set(words):
+        found.relative = found.relative or comment
 
 
 def _read_north(found: Statements, comment: str, words: Sequence[str]) -> None:

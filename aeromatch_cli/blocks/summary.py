@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.blocks.plausibility import warnings_of
-from aeromatch_cli.data import Block, Pair
+from aeromatch_cli.data import Block, FloatArray, Pair
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.geometry.frames import length_words
 from aeromatch_cli.geometry.rotations import tilt_deg
@@ -109,38 +110,50 @@ def summarise(block: Block, pairs: Sequence[Pair] | None = None) -> BlockSummary
     """
     names = {image.image_id: image.name for image in block.images}
     poses = {i: block.poses[i] for i in names if i in block.poses and np.isfinite(block.poses[i].center_m).all()}
-    centers = np.array([pose.center_m for pose in poses.values()]).reshape(-1, 3)
-    tilts = [tilt_deg(pose.world_rotation) for pose in poses.values() if pose.world_rotation is not None]
-    heights = np.zeros(0)
-    if block.ground is not None and len(centers):
-        heights = centers[:, 2] - block.ground.height_m(centers[:, :2])
-    low, median, high = np.percentile(heights, [0, 50, 100]).tolist() if len(heights) else [float("nan")] * 3
-    gsds = [footprint.gsd_m for footprint in block_footprints(block).values()]
-    east, north = np.ptp(centers[:, :2], axis=0).tolist() if len(centers) else (float("nan"), float("nan"))
-    best = _best_overlaps(pairs or ())
-    paired = {image_id for pair in pairs or () for image_id in (pair.image_id0, pair.image_id1)}
-    reasons = sorted({pair.reason for pair in pairs or ()})
-    unpaired = () if pairs is None else tuple(name for image_id, name in names.items() if image_id not in paired)
+    centers_m = np.array([pose.center_m for pose in poses.values()]).reshape(-1, 3)
+    tilts_deg = [tilt_deg(pose.world_rotation) for pose in poses.values() if pose.world_rotation is not None]
+    gsds_m = [footprint.gsd_m for footprint in block_footprints(block).values()]
+    unpaired = () if pairs is None else _unpaired(names, pairs)
     return BlockSummary(
         images=len(block.images),
         cameras=len({image.camera_id for image in block.images}),
         positioned=len(poses),
-        oriented=len(tilts),
+        oriented=len(tilts_deg),
         crs=block.crs,
         metric=block.metric,
         origin_m=block.origin_m,
         ground_source=block.ground_source,
-        flying_height_m=(low, median, high),
-        mean_tilt_deg=float(np.mean(tilts)) if tilts else float("nan"),
-        max_tilt_deg=float(np.max(tilts)) if tilts else float("nan"),
-        gsd_m=float(np.median(gsds)) if gsds else float("nan"),
-        extent_m=(east, north),
+        flying_height_m=_flying_height_m(block, centers_m),
+        mean_tilt_deg=_known(np.mean, tilts_deg),
+        max_tilt_deg=_known(np.max, tilts_deg),
+        gsd_m=_known(np.median, gsds_m),
+        extent_m=(_known(np.ptp, centers_m[:, 0]), _known(np.ptp, centers_m[:, 1])),
         pairs=None if pairs is None else len(pairs),
-        pairs_by_reason=tuple((reason, sum(pair.reason == reason for pair in pairs or ())) for reason in reasons),
-        best_overlap=float(np.mean(list(best.values()))) if best else float("nan"),
+        pairs_by_reason=tuple(sorted(Counter(pair.reason for pair in pairs or ()).items())),
+        best_overlap=_known(np.mean, list(_best_overlaps(pairs or ()).values())),
         unpaired=unpaired,
         warnings=warnings_of(block, unpaired),
     )
+
+
+def _known(function: Callable[[Any], Any], values: Sequence[float] | FloatArray) -> float:
+    """Return a figure of values (N,), NaN where there are none."""
+    return float(function(values)) if len(values) else float("nan")
+
+
+def _flying_height_m(block: Block, centers_m: FloatArray) -> tuple[float, float, float]:
+    """Return the least, the median and the largest height of projection centres (N, 3) above the ground below each."""
+    if block.ground is None or not len(centers_m):
+        return float("nan"), float("nan"), float("nan")
+    heights_m = centers_m[:, 2] - block.ground.height_m(centers_m[:, :2])
+    low, median, high = np.percentile(heights_m, [0, 50, 100]).tolist()
+    return low, median, high
+
+
+def _unpaired(names: Mapping[str, str], pairs: Sequence[Pair]) -> tuple[str, ...]:
+    """Return the names of the images that no pair has. names: by image_id."""
+    paired = {image_id for pair in pairs for image_id in (pair.image_id0, pair.image_id1)}
+    return tuple(name for image_id, name in names.items() if image_id not in paired)
 
 
 def _best_overlaps(pairs: Sequence[Pair]) -> Mapping[str, float]:

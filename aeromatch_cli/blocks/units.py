@@ -128,15 +128,27 @@ def degrees_of(text: str, sides: str = "") -> float | None:
     if match is None:
         return None
     front, sign, degrees, *minutes, back = match.groups()
+    if front and back:
+        return None
     side = front or back
-    if (front and back) or (side and (side not in sides or sign)):
+    if side and (side not in sides or sign):
         return None
-    minutes = minutes if len(minutes) < 3 or not minutes[2] else [minutes[2]]
+    total = _sexagesimal(degrees, minutes)
+    if total is None:
+        return None
+    negative = sign == "-" or (side != "" and side == sides[1])
+    return -total if negative else total
+
+
+def _sexagesimal(degrees: str, minutes: list[str]) -> float | None:
+    """Return degrees of whole degrees and of minutes and seconds, or decimal minutes in the last of three cells; None
+    where sixty minutes, which are a degree, are named."""
+    if len(minutes) == 3 and minutes[2]:
+        minutes = minutes[2:]
     values = [float(cell.replace(",", ".")) for cell in (degrees, *minutes) if cell]
-    if any(value >= 60.0 for value in values[1:]):  # sixty minutes are a degree
+    if any(value >= 60.0 for value in values[1:]):
         return None
-    total = sum(value / 60.0**k for k, value in enumerate(values))
-    return -total if sign == "-" or (side and side == sides[1]) else total
+    return sum(value / 60.0**k for k, value in enumerate(values))
 
 
 # As ExifTool writes heights.

@@ -201,8 +201,13 @@ def xmp_position(xmp: Mapping[str, str]) -> tuple[float | None, float | None, fl
 
 def has_signs(xmp: Mapping[str, str]) -> bool:
     """Whether both degrees of the position say on which side they count: by a sign, by a letter, or by a tag."""
-    stated = (next((name for name in names if xmp.get(name)), "") for names in (_LATITUDES, _LONGITUDES))
-    return all(name and (re.search(r"[-+NSEW]", xmp[name]) or xmp.get(f"{name}Ref")) for name in stated)
+    for names in (_LATITUDES, _LONGITUDES):
+        stated = next((name for name in names if xmp.get(name)), "")
+        if not stated:
+            return False
+        if not re.search(r"[-+NSEW]", xmp[stated]) and not xmp.get(f"{stated}Ref"):
+            return False
+    return True
 
 
 def xmp_metres(xmp: Mapping[str, str], name: str) -> float | None:
@@ -228,17 +233,24 @@ def _first_degrees(xmp: Mapping[str, str], names: Iterable[str], largest: float)
     """Degrees as a number, whose hemisphere may stand in a tag of its own or as a letter beside it ("N 52.5"), or in
     Adobe's way: "52,30.5712N", "52,30,34.27N"."""
     for name in names:
-        text = xmp.get(name, "")
-        number = tag_number(text)
-        if number is not None and xmp.get(f"{name}Ref", "")[:1].upper() in ("S", "W"):
-            number = -abs(number)
-        if number is None and (parts := _ADOBE_DEGREES.fullmatch(text)):
-            number = float(parts[1]) + float(parts[2]) / 60.0 + float(parts[3] or 0.0) / 3600.0
-            number = -number if parts[4] in "SW" else number
-        if number is None and (one := _LETTERED.fullmatch(text)) and bool(one[1]) != bool(one[3]):
-            number = -float(one[2]) if one[1] + one[3] in "SW" else float(one[2])
+        number = _degrees(xmp.get(name, ""), xmp.get(f"{name}Ref", ""))
         if number is not None and abs(number) <= largest:
             return number
+    return None
+
+
+def _degrees(text: str, reference: str) -> float | None:
+    """Return the degrees that a text states. reference: the side of the globe of a plain number."""
+    number = tag_number(text)
+    if number is not None:
+        return -abs(number) if reference[:1].upper() in ("S", "W") else number
+    parts = _ADOBE_DEGREES.fullmatch(text)
+    if parts:
+        number = float(parts[1]) + float(parts[2]) / 60.0 + float(parts[3] or 0.0) / 3600.0
+        return -number if parts[4] in "SW" else number
+    one = _LETTERED.fullmatch(text)
+    if one and bool(one[1]) != bool(one[3]):
+        return -float(one[2]) if one[1] + one[3] in "SW" else float(one[2])
     return None
 
 
@@ -256,7 +268,9 @@ def xmp_angles(xmp: Mapping[str, str]) -> CameraAngles | None:
 def xmp_speed_m_s(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
     """Of the aircraft to true north, to the east and down, metres per second; None where XMP does not state all."""
     north, east, down = (tag_number(xmp.get(f"drone-dji:Flight{axis}Speed")) for axis in "XYZ")
-    return None if north is None or east is None or down is None else (north, east, down)
+    if north is None or east is None or down is None:
+        return None
+    return north, east, down
 
 
 def xmp_band(xmp: Mapping[str, str]) -> str:

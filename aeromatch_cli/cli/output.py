@@ -1,8 +1,9 @@
-"""Results to stdout, messages to stderr, errors to exit codes."""
+"""Results to stdout, messages to stderr and the log file, errors to exit codes."""
 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import re
@@ -19,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from aeromatch_cli import __version__
-from aeromatch_cli.cli.log import logged_to, record
-from aeromatch_cli.errors import AeromatchError, lacks_memory
+from aeromatch_cli.errors import AeromatchError, ConfigError, lacks_memory
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.command_result import Result
@@ -32,6 +32,9 @@ EXIT_INTERRUPTED = 130
 ARGUMENTS = "aeromatch.arguments"
 _FAILURES_SHOWN = 5
 _LONGEST_WORD = 1000
+LOGGER = "aeromatch"
+# What the screen shows in its own way: for the log file only.
+record = logging.getLogger(f"{LOGGER}.record")
 
 
 def guarded(
@@ -173,3 +176,34 @@ def as_texts(values: dict[str, Any]) -> dict[str, Any]:
 def as_epilog(examples: Sequence[str]) -> str:
     """Examples below a command's help, each on a line of its own: \b keeps click from filling the paragraph."""
     return "\b\nExamples:\n" + "\n".join(f"  {example}" for example in examples)
+
+
+@contextmanager
+def logged_to(log_file: Path | None, *, quiet: bool) -> Iterator[None]:
+    """Send messages to stderr, and all of them and the record, with time, to the log file: when the command began, what
+    each stage did, and how it ended. Raises ConfigError."""
+    logger = logging.getLogger(LOGGER)
+    logger.setLevel(logging.DEBUG)
+    logger.propagate = False
+    screen = logging.StreamHandler(sys.stderr)
+    screen.setLevel(logging.ERROR if quiet else logging.INFO)
+    screen.setFormatter(logging.Formatter("%(message)s"))
+    screen.addFilter(lambda message: message.name != record.name)
+    handlers: list[logging.Handler] = [screen]
+    if log_file is not None:
+        try:
+            log_file.parent.mkdir(parents=True, exist_ok=True)
+            file = logging.FileHandler(log_file, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"--log-file {log_file} cannot be written: {error.strerror}") from None
+        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        handlers.append(file)
+    for handler in handlers:
+        logger.addHandler(handler)
+    logging.raiseExceptions = False  # a log file on a full disk must not print tracebacks
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            logger.removeHandler(handler)
+            handler.close()

@@ -38,34 +38,18 @@ _PHRASES = {
 
 
 def describe(fault: ErrorDetails, root: type[BaseModel], families: Families) -> str:
-    """One line for one pydantic fault. root: the whole tree's class; families: section -> its table of strategies."""
+    """Return one line for one pydantic fault. root: the whole tree's class; families: section -> its strategies."""
     location = tuple(fault["loc"])
     names = [str(part) for part in _visible(location, families)]
     place = ".".join(names)
     family = families.get(str(location[0]), {}) if location else {}
     kind = fault["type"]
     if kind == "extra_forbidden":
-        siblings = _siblings(location[:-1], root, families)
-        renamed = new_key(str(location[0]), names[-1], frozenset(siblings))
-        if renamed:
-            return f"{place}: this setting is now named {renamed}; write {'.'.join([*names[:-1], renamed])}"
-        owners = [name for name, strategy in family.items() if names[-1] in strategy.model_fields]
-        if owners and len(names) > 1:
-            return f"{place}: unknown key here, it belongs to {' and '.join(owners)}{nearest(names[-1], siblings)}"
-        elsewhere = _places(names[-1], root, families) if len(names) == 1 else []
-        if elsewhere:
-            return f"{place}: unknown key; did you mean {_either(elsewhere)}?"
-        return f"{place}: unknown key{nearest(names[-1], siblings)}"
-    if kind == "union_tag_invalid" or (kind == "literal_error" and family and location[-1] == "name"):
-        name = str(fault["ctx"]["tag"] if kind == "union_tag_invalid" else fault["input"])
-        renamed = STRATEGIES.get(str(location[0]), {}).get(name)
-        if renamed:
-            return f"{place.removesuffix('.name')}: the strategy {name!r} is now named {renamed!r}"
-        if name in DROPPED.get(str(location[0]), ()):
-            return (
-                f"{place.removesuffix('.name')}: there is no strategy {name!r} any more; take {_either(list(family))}"
-            )
-        return f"{place.removesuffix('.name')}: no strategy is named {name!r}{nearest(name, list(family))}"
+        return f"{place}: {_unknown_key(location, names, root, families)}"
+    if kind == "union_tag_invalid":
+        return f"{place.removesuffix('.name')}: {_unknown_strategy(str(location[0]), str(fault['ctx']['tag']), family)}"
+    if kind == "literal_error" and family and location[-1] == "name":
+        return f"{place.removesuffix('.name')}: {_unknown_strategy(str(location[0]), str(fault['input']), family)}"
     if kind == "union_tag_not_found":
         return f"{place}: name the strategy (name: ...), one of {', '.join(family)} (got {_shown(fault['input'])})"
     if fault["input"] is None and family and kind.startswith("model_"):
@@ -75,6 +59,34 @@ def describe(fault: ErrorDetails, root: type[BaseModel], families: Families) -> 
     phrase = _PHRASES.get(kind) or fault["msg"].replace("Input should", "must")
     hint = _whole_number(fault["input"]) if kind == "int_parsing" else ""
     return f"{place or 'top level'}: {phrase} (got {_shown(fault['input'])}){hint}"
+
+
+def _unknown_key(location: tuple[Any, ...], names: Sequence[str], root: type[BaseModel], families: Families) -> str:
+    """Say what to write for a key that is not known. names: of its place, as `--set` would write it."""
+    section, key = str(location[0]), names[-1]
+    siblings = _siblings(location[:-1], root, families)
+    renamed = new_key(section, key, frozenset(siblings))
+    if renamed:
+        return f"this setting is now named {renamed}; write {'.'.join([*names[:-1], renamed])}"
+    if len(names) == 1:
+        elsewhere = _places(key, root, families)
+        if elsewhere:
+            return f"unknown key; did you mean {_either(elsewhere)}?"
+    else:
+        owners = [name for name, strategy in families.get(section, {}).items() if key in strategy.model_fields]
+        if owners:
+            return f"unknown key here, it belongs to {' and '.join(owners)}{nearest(key, siblings)}"
+    return f"unknown key{nearest(key, siblings)}"
+
+
+def _unknown_strategy(section: str, name: str, family: Mapping[str, type[BaseModel]]) -> str:
+    """Say what to write for the name of a strategy that is not known."""
+    renamed = STRATEGIES.get(section, {}).get(name)
+    if renamed:
+        return f"the strategy {name!r} is now named {renamed!r}"
+    if name in DROPPED.get(section, ()):
+        return f"there is no strategy {name!r} any more; take {_either(list(family))}"
+    return f"no strategy is named {name!r}{nearest(name, list(family))}"
 
 
 def root_faults(faults: Sequence[ErrorDetails]) -> list[ErrorDetails]:
@@ -88,13 +100,15 @@ def root_faults(faults: Sequence[ErrorDetails]) -> list[ErrorDetails]:
 
 
 def accidents(given: Any, validated: Any, place: str = "") -> Iterator[str]:
-    """Faults that the types let through: YAML reads a bare `yes` as true, and true would pass as the number 1."""
+    """Find faults that the types let through: YAML reads a bare `yes` as true, and true would pass as the number 1."""
     if isinstance(given, Mapping) and isinstance(validated, Mapping):
-        for key in (k for k in validated if k in given):
-            yield from accidents(given[key], validated[key], f"{place}.{key}" if place else str(key))
+        for key in validated:
+            if key in given:
+                yield from accidents(given[key], validated[key], f"{place}.{key}" if place else str(key))
     elif isinstance(given, list) and isinstance(validated, list):
         for one, other in zip(given, validated, strict=True):
-            yield from accidents(one, other, f"{place}.{other['name']}" if isinstance(other, Mapping) else place)
+            place_of_one = f"{place}.{other['name']}" if isinstance(other, Mapping) else place
+            yield from accidents(one, other, place_of_one)
     elif isinstance(given, bool) and not isinstance(validated, bool):
         yield f"{place}: must be a number (got {given!r})"
     elif isinstance(given, str) and "\0" in given:
@@ -152,16 +166,18 @@ def _shown(value: Any) -> str:
 def _visible(location: tuple[Any, ...], families: Families) -> Iterator[Any]:
     """The location as `--set` would write it: without chain positions and the union tags that pydantic puts in."""
     family = families.get(str(location[0])) if location else None
-    chained = len(location) > 1 and isinstance(location[1], int)
-    for index, part in enumerate(location):
-        if isinstance(part, int):
-            # A chain's member is told by its name, which pydantic leaves out where the family has only one.
-            if family is not None and len(family) == 1 and index == 1 and len(location) > 2:
-                yield next(iter(family))
-            continue
-        is_tag = family is not None and len(family) > 1 and not chained and index == 1 and part in family
-        if not is_tag:
-            yield part
+    if family is None or len(location) < 2:
+        yield from (part for part in location if not isinstance(part, int))
+        return
+    section, second, *others = location
+    yield section
+    if isinstance(second, int):
+        # A chain's member is told by its name, which pydantic leaves out where the family has only one.
+        if len(family) == 1 and others:
+            yield next(iter(family))
+    elif len(family) == 1 or second not in family:
+        yield second
+    yield from (part for part in others if not isinstance(part, int))
 
 
 def _siblings(location: tuple[Any, ...], root: type[BaseModel], families: Families) -> list[str]:

@@ -104,26 +104,38 @@ def _read_tree(source: str) -> tuple[dict[str, Any], str]:
     default preset.
     """
     tree: dict[str, Any] = Settings().model_dump(mode="json")
+    text, origin, folder = _text_of(source)
+    differences = _parsed(text, origin)
+    if folder is not None:
+        _merge_preset(tree, differences.pop("preset", DEFAULT_PRESET), origin)
+    merge(tree, absolute_paths(differences, tree, folder) if folder else differences)
+    return tree, origin
+
+
+def _text_of(source: str) -> tuple[str, str, Path | None]:
+    """Return the text of a preset, file or workspace, the source in words, and the folder of a file. Raises
+    ConfigError."""
     path = Path(source)
     if source not in preset_names() and (path / "block.json").is_file():
         path /= "config.yaml"  # of a workspace
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
     if not is_yaml and source in preset_names():
-        text, origin, folder = read_text(_preset_folder() / f"{source}.yaml"), f"preset {source}", None
-    elif (path / ".lock").is_file():
+        return read_text(_preset_folder() / f"{source}.yaml"), f"preset {source}", None
+    if (path / ".lock").is_file():
         raise ConfigError(
             f"{source!r} is a workspace whose run has not got as far as to write its settings: let it end, or run the "
             "same command again"
         )
-    elif path.is_dir():
+    if path.is_dir():
         raise ConfigError(f"{source!r} is a folder: give a folder of images with --images, as in: --images {source}")
-    elif is_yaml or path.is_file():
-        text, origin, folder = read_text(path), str(path), path.absolute().parent
-    else:
-        hint = nearest(source, preset_names(), otherwise="")
-        raise ConfigError(
-            f"{source!r} is neither a YAML file nor a preset; presets are {', '.join(preset_names())}{hint}"
-        )
+    if is_yaml or path.is_file():
+        return read_text(path), str(path), path.absolute().parent
+    hint = nearest(source, preset_names(), otherwise="")
+    raise ConfigError(f"{source!r} is neither a YAML file nor a preset; presets are {', '.join(preset_names())}{hint}")
+
+
+def _parsed(text: str, origin: str) -> dict[str, Any]:
+    """Return the settings that a text in YAML holds. Raises ConfigError."""
     try:
         differences = yaml.load(text, UniqueKeyLoader) or {}
     except RecursionError:
@@ -134,7 +146,4 @@ def _read_tree(source: str) -> tuple[dict[str, Any], str]:
         raise ConfigError(f"{origin} holds a number of too many digits, or a date that no calendar has") from None
     if not isinstance(differences, dict):
         raise ConfigError(f"{origin} must hold keys and values at the top, not a {type(differences).__name__}")
-    if folder is not None:
-        _merge_preset(tree, differences.pop("preset", DEFAULT_PRESET), origin)
-    merge(tree, absolute_paths(differences, tree, folder) if folder else differences)
-    return tree, origin
+    return differences

@@ -23,12 +23,15 @@ def merge(tree: dict[str, Any], differences: Mapping[str, Any]) -> None:
             if value is None and "none" in FAMILIES[key]:
                 value = "none"
             value = chain(value) if isinstance(current, list) else named(value)
-        if isinstance(current, dict) and isinstance(value, Mapping):
-            if "name" in current and value.get("name", current["name"]) != current["name"]:
+        if not isinstance(current, dict):
+            tree[key] = copy.deepcopy(value)
+        elif isinstance(value, Mapping):
+            other_strategy = "name" in current and value.get("name", current["name"]) != current["name"]
+            if other_strategy:
                 tree[key] = copy.deepcopy(dict(value))
             else:
                 merge(current, value)
-        elif key in FAMILIES or not (isinstance(current, dict) and value is None):  # an empty section changes nothing
+        elif key in FAMILIES or value is not None:  # an empty section changes nothing
             tree[key] = copy.deepcopy(value)
 
 
@@ -101,6 +104,8 @@ def differing(first: Any, second: Any, place: str = "") -> Iterator[tuple[str, A
 
 
 def _names(value: Any) -> list[Any]:
-    """Of a list of strategies; nothing of other values."""
-    strategies = isinstance(value, list) and all(isinstance(one, Mapping) and "name" in one for one in value)
-    return [one["name"] for one in value] if strategies else []
+    """Return the names of a list of strategies; nothing of other values."""
+    if not isinstance(value, list):
+        return []
+    names = [one["name"] for one in value if isinstance(one, Mapping) and "name" in one]
+    return names if len(names) == len(value) else []

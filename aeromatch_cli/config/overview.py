@@ -179,7 +179,9 @@ def _settings_text(
     images: str, facts: list[ExifFacts], poses: list[tuple[str, str]], cameras: str, gcp: str, found: list[str]
 ) -> str:
     located = any(fact.latitude_deg is not None for fact in facts)
-    chosen = poses[0][0] if poses else "exif" if located else "none"
+    chosen = "exif" if located else "none"
+    if poses:
+        chosen, _ = poses[0]
     others = "".join(f"  # poses: {scalar(path)}  # {title}\n" for path, title in poses[1:])
     seen = "".join(f"#   {line}\n" for line in found)
     return f"""# Settings of aeromatch for one block: aeromatch run FILE. Paths are relative to this file.

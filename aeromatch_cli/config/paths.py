@@ -40,18 +40,25 @@ def absolute_paths(differences: Mapping[str, Any], tree: Mapping[str, Any], fold
 
 
 def _absolute_block_path(key: Any, value: Any, folder: Path) -> Any:
-    if key == "exclude" and isinstance(value, str):  # names and patterns, and files that hold them
-        below = [_below(folder, entry.strip()) for entry in value.split(",")]
-        return ",".join(
-            path if Path(path).is_file() else entry for path, entry in zip(below, value.split(","), strict=True)
-        )
-    if key not in PATH_KEYS or not isinstance(value, str) or not value or value in _WORDS.get(key, ()):
+    """Return a setting of the block with the paths that it holds below a folder; words and numbers stay."""
+    if not isinstance(value, str):
+        return value
+    if key == "exclude":
+        return ",".join(_absolute_list(entry, folder) for entry in value.split(","))
+    if key not in PATH_KEYS or not value or value in _WORDS.get(key, ()):
         return value
     if key == "images" and "://" in value:
         return value
     if key == "ground" and looks_like_height(value):
-        return value if value[-1:].isdigit() or not Path(_below(folder, value)).exists() else _below(folder, value)
+        is_file = not value[-1:].isdigit() and Path(_below(folder, value)).exists()
+        return _below(folder, value) if is_file else value
     return _below(folder, value)
+
+
+def _absolute_list(entry: str, folder: Path) -> str:
+    """Return an entry of `exclude`: the path of a file of names, else the name or pattern as it is."""
+    path = _below(folder, entry.strip())
+    return path if Path(path).is_file() else entry
 
 
 def absolute_strategy_paths(values: Mapping[str, Any], strategy: type[Strategy] | None, folder: Path) -> dict[str, Any]:

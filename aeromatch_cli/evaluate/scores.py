@@ -13,7 +13,7 @@ CORRECT_PX, WITHIN_PX = 3.0, 5.0
 # Class -> its upper bound, exclusive.
 VIEW_ANGLE_CLASSES = (("0-20", 20.0), ("20-40", 40.0), ("40-60", 60.0), (">60", math.inf))
 SHADOW_CLASSES = (("<5 %", 0.05), ("5-20 %", 0.20), (">=20 %", math.inf))
-# Local grey-level deviation over the local mean; texture.py says how it is measured and what the bounds part.
+# Local grey-level deviation over the local mean; overlap.py says how it is measured and what the bounds part.
 TEXTURE_CLASSES = (("poor", 0.05), ("medium", 0.15), ("rich", math.inf))
 UNKNOWN = "unknown"
 HARD_SHADOW_SHARE, HARD_VIEW_ANGLE_DEG = 0.20, 30.0
@@ -30,7 +30,7 @@ class Conditions:
 
     view_angle_deg: median angle between both rays over the places that both images see. overlap: share of an image's
     pixels that the other image sees, the larger of both. shadow_share: share of the overlap in shadow, the larger of
-    both images'. texture: see texture.py, the smaller of both images'. NaN where unknown.
+    both images'. texture: see overlap.py, the smaller of both images'. NaN where unknown.
     """
 
     view_angle_deg: float

@@ -1,16 +1,21 @@
-"""The block after bundle adjustment on file: arrays for the program, a table for people."""
+"""The block after bundle adjustment on file: its arrays, the matches that contradict it, and two tables for people.
+
+adjusted.npz and dropped.npz are read by the program; orientation.csv and residuals.csv have one line per image.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, Image
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, Image, IntArray, PoseResidual
 from aeromatch_cli.formats.archives import load_arrays, save_arrays
-from aeromatch_cli.formats.tables import csv_text
+from aeromatch_cli.formats.reading import readable
+from aeromatch_cli.formats.tables import csv_text, read_csv
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 
 _POSES = ("rotations", "centers_m", "sigmas_m", "sigmas_deg", "sweeps_m")
@@ -30,6 +35,16 @@ ORIENTATION = (
     "image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m",
     "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera", "frame", "unit",
 )  # fmt: skip
+# image_id0, image_id1 -> fingerprint of the verified entry, and rows of its matches.
+Dropped = Mapping[tuple[str, str], tuple[str, IntArray]]
+_DROPPED_ARRAYS = ("images", "fingerprints", "counts", "rows", "least")
+# Field of a residual -> its columns of residuals.csv.
+_RESIDUAL_COLUMNS = {
+    "position_m": ("dx_m", "dy_m", "dz_m"),
+    "position_sigmas": ("dx_sigmas", "dy_sigmas", "dz_sigmas"),
+    "rotation_deg": ("rotation_x_deg", "rotation_y_deg", "rotation_z_deg"),
+    "rotation_sigmas": ("rotation_x_sigmas", "rotation_y_sigmas", "rotation_z_sigmas"),
+}
 
 
 def write_adjusted(stream: BinaryIO, adjusted: AdjustedBlock) -> None:
@@ -116,3 +131,75 @@ def orientation_fields(adjusted: AdjustedBlock, block: Block, image: Image) -> d
 
 def _rows(values: list[FloatArray]) -> FloatArray:
     return np.array(values, dtype=np.float64).reshape(-1, 3)
+
+
+def write_dropped(stream: BinaryIO, dropped: Dropped, least: int) -> None:
+    """Write the rejected matches of every pair as an .npz without pickles. least: a pair that keeps fewer matches is
+    rejected."""
+    keys = sorted(dropped)
+    save_arrays(
+        stream,
+        images=np.array(keys, dtype=np.str_).reshape(-1, 2),
+        fingerprints=np.array([dropped[key][0] for key in keys], dtype=np.str_),
+        counts=np.array([len(dropped[key][1]) for key in keys], dtype=np.int64),
+        rows=np.concatenate([np.zeros(0, np.int32), *(dropped[key][1] for key in keys)]).astype(np.int32),
+        least=np.array(least),
+    )
+
+
+def read_dropped(path: Path) -> tuple[Dropped, int]:
+    """Read what `write_dropped` wrote; nothing where there is no file. Raises BrokenFileError where it is broken."""
+    if not path.exists():
+        return {}, 0
+    arrays = load_arrays(path, _DROPPED_ARRAYS)
+    rows = np.split(arrays["rows"], np.cumsum(arrays["counts"])[:-1]) if len(arrays["counts"]) else []
+    found = {
+        (str(id0), str(id1)): (str(made_of), own)
+        for (id0, id1), made_of, own in zip(arrays["images"], arrays["fingerprints"], rows, strict=True)
+    }
+    return found, int(arrays["least"])
+
+
+def residual_fields(residual: PoseResidual | None) -> dict[str, float]:
+    """Return the values of a line of residuals.csv by their columns, NaN where they are unknown."""
+    unknown = np.full(3, np.nan)
+    found = {
+        column: float(value)
+        for field, columns in _RESIDUAL_COLUMNS.items()
+        for column, value in zip(columns, unknown if residual is None else getattr(residual, field), strict=True)
+    }
+    found["error_px"] = float("nan") if residual is None else residual.error_px
+    found["points"] = 0 if residual is None else residual.points
+    found["images_per_point"] = float("nan") if residual is None else residual.images_per_point
+    return found
+
+
+def residuals_text(residuals: Mapping[str, PoseResidual], images: Iterable[Image]) -> str:
+    """Return residuals.csv: one line per adjusted image, by name, with empty cells where nothing was given."""
+    rows = []
+    for image in sorted(images, key=lambda image: image.name):
+        if image.image_id in residuals:
+            values = residual_fields(residuals[image.image_id])
+            # Rounding errors of positions that stay are no residuals; + 0.0 leaves no minus before a zero.
+            rows.append((image.name, *(v if isinstance(v, int) else round(v, 6) + 0.0 for v in values.values())))
+    return csv_text(("image", *residual_fields(None)), rows)
+
+
+def read_residuals(path: Path, images: Iterable[Image]) -> dict[str, PoseResidual]:
+    """Read residuals.csv, by image_id. Raises BrokenFileError where it is missing or broken."""
+    ids = {image.name: image.image_id for image in images}
+    with readable(path, ValueError, KeyError):
+        return {ids[row["image"]]: _residual(row) for row in read_csv(path)}
+
+
+def _residual(row: Mapping[str, str]) -> PoseResidual:
+    def numbers(columns: Iterable[str]) -> FloatArray:
+        return np.array([float(row[column] or "nan") for column in columns])
+
+    error_px, images_per_point = (float(value) for value in numbers(("error_px", "images_per_point")))
+    position_m, position_sigmas, rotation_deg, rotation_sigmas = (
+        numbers(columns) for columns in _RESIDUAL_COLUMNS.values()
+    )
+    return PoseResidual(
+        position_m, position_sigmas, rotation_deg, rotation_sigmas, error_px, int(row["points"]), images_per_point
+    )

@@ -1,4 +1,4 @@
-"""The workspace's feature files."""
+"""The workspace's files of keypoints: features of an image, joined keypoints of a cascade, and refined places."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import (
+    BoolArray,
     Features,
     FloatArray,
     JoinedKeypoints,
@@ -78,3 +79,42 @@ def checked_keypoints(path: Path) -> tuple[str, FloatArray | None]:
 def features_fingerprint(path: Path) -> str:
     """Return the fingerprint that a feature file states; nothing else of it is read. Raises BrokenFileError."""
     return str(load_arrays(path, ("fingerprint",))["fingerprint"])
+
+
+def write_refined(stream: BinaryIO, keypoints_px: FloatArray, measured: BoolArray, fingerprint: str) -> None:
+    """Write the refined places of the keypoints of an image.
+
+    keypoints_px: (K, 2) of all keypoints. measured: (K,) which of them stand for their points or were measured by those
+    that do. fingerprint: of the features whose keypoints these are.
+    """
+    places = keypoints_px.astype(np.float32)
+    save_arrays(stream, fingerprint=np.array(fingerprint), keypoints_px=places, measured=measured)
+
+
+def read_final_keypoints(features: Path, refined: Path) -> FloatArray:
+    """Return (K, 2) stored pixels of an image's keypoints: where they were measured, else where the detector put them;
+    none of an image without features. Raises BrokenFileError where a file is broken."""
+    if not features.is_file():
+        return np.zeros((0, 2), np.float32)
+    places = _measured(refined, features_fingerprint(features)) if refined.is_file() else None
+    return read_keypoints(features)[0] if places is None else places
+
+
+def checked_final_keypoints(features: Path, refined: Path) -> tuple[str, FloatArray | None]:
+    """Fingerprint of the features and the same places; "" and None, with a warning, where the features are broken.
+    Where the other file is broken, a warning and the places where the detector put the keypoints."""
+    fingerprint, detected = checked_keypoints(features)
+    try:
+        places = None if detected is None else _measured(refined, fingerprint)
+    except BrokenFileError as error:
+        say_damaged(refined, error)
+        return fingerprint, detected
+    return fingerprint, detected if places is None else places
+
+
+def _measured(refined: Path, fingerprint: str) -> FloatArray | None:
+    """Return the measured places (K, 2), None where there are none of the features with this fingerprint."""
+    if not refined.is_file():
+        return None
+    found = load_arrays(refined, ("keypoints_px", "fingerprint"))
+    return found["keypoints_px"] if str(found["fingerprint"]) == fingerprint else None

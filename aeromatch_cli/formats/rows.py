@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import (
+    FloatArray,
     IntArray,
     Matches,
     Verdict,
@@ -165,16 +166,16 @@ def _row_arrays(entries: Sequence[MatchEntry] | Sequence[VerifiedEntry]) -> dict
         "scores": _joined([m.scores for m in matches], (0,), np.float32),
     }
     if any(m.points0_px is not None for m in matches):
-        for name in ("points0_px", "points1_px"):
-            parts = [getattr(m, name) for m in matches]
-            filled = [
-                np.full((len(m.indices), 2), np.nan) if x is None else x for m, x in zip(matches, parts, strict=True)
-            ]
-            arrays[name] = _joined(filled, (0, 2), np.float64)
+        arrays["points0_px"] = _joined([_known(m, m.points0_px, (2,)) for m in matches], (0, 2), np.float64)
+        arrays["points1_px"] = _joined([_known(m, m.points1_px, (2,)) for m in matches], (0, 2), np.float64)
     if any(m.sigmas_px is not None for m in matches):
-        sigmas = [np.full(len(m.indices), np.nan) if m.sigmas_px is None else m.sigmas_px for m in matches]
-        arrays["sigmas_px"] = _joined(sigmas, (0,), np.float32)
+        arrays["sigmas_px"] = _joined([_known(m, m.sigmas_px, ()) for m in matches], (0,), np.float32)
     return arrays
+
+
+def _known(matches: Matches, values: FloatArray | None, shape: tuple[int, ...]) -> FloatArray:
+    """Return values (M, *shape) of matches (M,), NaN where a pair has none."""
+    return np.full((len(matches.indices), *shape), np.nan) if values is None else values
 
 
 def _joined(parts: Sequence[NDArray[Any]], empty_shape: tuple[int, ...], dtype: type) -> NDArray[Any]:

@@ -37,7 +37,9 @@ def _cell(value: Any) -> str:
         return ""
     text = repr(float(value)) if isinstance(value, float) else str(value)
     # csv.writer leaves a lone carriage return unquoted, and the reader would end the row there.
-    return '"' + text.replace('"', '""') + '"' if any(mark in text for mark in ',"\r\n') else text
+    if any(mark in text for mark in ',"\r\n'):
+        return '"' + text.replace('"', '""') + '"'
+    return text
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:

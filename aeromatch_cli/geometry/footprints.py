@@ -209,13 +209,7 @@ def block_footprints(block: Block, max_distance_factor: float = MAX_DISTANCE_FAC
     if block.ground is None:
         return {}
     cameras = {image.image_id: block.camera(image) for image in block.images}
-    poses = {
-        i: pose
-        for i in cameras
-        if (pose := block.poses.get(i)) is not None
-        and pose.world_rotation is not None
-        and np.isfinite(pose.center_m).all()
-    }
+    poses = {i: block.poses[i] for i in cameras if i in block.poses and _is_whole(block.poses[i])}
     found = {}
     for image_id, pose in poses.items():
         footprint = image_footprint(cameras[image_id], pose, block.ground, max_distance_factor)
@@ -223,18 +217,43 @@ def block_footprints(block: Block, max_distance_factor: float = MAX_DISTANCE_FAC
             found[image_id] = footprint
     least_m = _LEAST_SHARE * (common_gsd_m(found) or 0.0)
     sound = {i: footprint for i, footprint in found.items() if footprint.gsd_m >= least_m}
-    for image_id in poses.keys() - sound.keys() if sound else ():
-        pose, terrain = poses[image_id], found.get(image_id)
-        z_m = float(block.ground.height_m(pose.center_m[None, :2])[0]) if terrain is None else terrain.ground_z_m
-        if terrain is None and z_m < pose.center_m[2]:
-            continue  # it looks at the sky
-        plane = _plane_footprint(cameras[image_id], pose, _plane_around_m(pose, poses, sound), max_distance_factor)
-        if plane is not None and (terrain is None or terrain.gsd_m < _LEAST_SHARE * plane.gsd_m):
-            camera = cameras[image_id]
-            share = 0.0 if terrain is None else terrain.gsd_m / plane.gsd_m
-            size = Degenerate(z_m, round(share * camera.width_px), round(share * camera.height_px))
-            found[image_id] = replace(plane, degenerate=size)
+    if sound:
+        for image_id in poses.keys() - sound.keys():
+            pose, terrain = poses[image_id], found.get(image_id)
+            plane_z_m = _plane_around_m(pose, poses, sound)
+            degenerate = _degenerate_footprint(
+                cameras[image_id], pose, block.ground, terrain, plane_z_m, max_distance_factor
+            )
+            if degenerate is not None:
+                found[image_id] = degenerate
     return {i: found[i] for i in cameras if i in found}
+
+
+def _is_whole(pose: Pose) -> bool:
+    """Whether a pose has a position and an attitude."""
+    return pose.world_rotation is not None and bool(np.isfinite(pose.center_m).all())
+
+
+def _degenerate_footprint(
+    camera: Camera,
+    pose: Pose,
+    ground: Ground,
+    terrain: Footprint | None,
+    plane_z_m: float,
+    max_distance_factor: float,
+) -> Footprint | None:
+    """Return the footprint on a plane of an image whose footprint on the terrain is far smaller or is none.
+
+    terrain: the latter. None where the image looks at the sky, and where the plane gives no larger footprint.
+    """
+    z_m = float(ground.height_m(pose.center_m[None, :2])[0]) if terrain is None else terrain.ground_z_m
+    if terrain is None and z_m < pose.center_m[2]:
+        return None
+    plane = _plane_footprint(camera, pose, plane_z_m, max_distance_factor)
+    if plane is None or (terrain is not None and terrain.gsd_m >= _LEAST_SHARE * plane.gsd_m):
+        return None
+    share = 0.0 if terrain is None else terrain.gsd_m / plane.gsd_m
+    return replace(plane, degenerate=Degenerate(z_m, round(share * camera.width_px), round(share * camera.height_px)))
 
 
 def _plane_around_m(pose: Pose, poses: Mapping[str, Pose], footprints: Mapping[str, Footprint]) -> float:

@@ -96,8 +96,10 @@ class _Known:
 
     def valid(self, alpha_is_mask: bool) -> BoolArray | None:
         alpha = self.alpha if alpha_is_mask else None
-        if self.known is None or alpha is None:
-            return alpha if self.known is None else self.known
+        if self.known is None:
+            return alpha
+        if alpha is None:
+            return self.known
         return np.asarray(self.known & alpha)
 
 

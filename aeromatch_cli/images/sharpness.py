@@ -82,8 +82,10 @@ def _sigma(values: FloatArray) -> float:
 
 
 def shows_nothing(quality: PictureQuality) -> str:
-    """ "black" or "white" of a picture that is little else, else ""."""
-    return "black" if quality.black >= _NOTHING else "white" if quality.white >= _NOTHING else ""
+    """Return "black" or "white" of a picture that is little else, else ""."""
+    if quality.black >= _NOTHING:
+        return "black"
+    return "white" if quality.white >= _NOTHING else ""
 
 
 def _windows(shape: tuple[int, ...], valid: BoolArray | None) -> list[tuple[slice, slice]]:

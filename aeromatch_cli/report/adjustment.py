@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from aeromatch_cli.data import AdjustedBlock, Camera, PoseResidual
-from aeromatch_cli.formats.adjusted import read_adjusted
-from aeromatch_cli.formats.residuals import read_residuals
+from aeromatch_cli.formats.adjusted import read_adjusted, read_residuals
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.results.adjustment import Control

@@ -96,11 +96,14 @@ def _rows(calibration: Calibration, held_by: Mapping[str, str]) -> Iterator[tupl
         held = sigma == 0.0
         change = f"{round((value - prior) / prior_sigma, 1) + 0.0:+.1f}" if prior_sigma > 0.0 and not held else ""
         digits = 2 if _UNITS.get(name) == "px" else 6
+        found = f"{sigma:.{digits}f}"
+        if held:
+            found = f"held by {held_by[name]}" if name in held_by else "held"
         yield (
             _NAMES.get(name, name),
             _UNITS.get(name, ""),
             f"{value:.{digits}f}",
-            (f"held by {held_by[name]}" if name in held_by else "held") if held else f"{sigma:.{digits}f}",
+            found,
             f"{prior:.{digits}f}",
             f"{prior_sigma:.{digits}f}" if prior_sigma > 0.0 else "",
             change,

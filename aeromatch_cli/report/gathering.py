@@ -23,8 +23,7 @@ from aeromatch_cli.data import FloatArray, Image, Pair
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json
-from aeromatch_cli.formats.features import read_keypoints
-from aeromatch_cli.formats.refined import checked_final_keypoints
+from aeromatch_cli.formats.features import checked_final_keypoints, read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.geometry.coverage import cells_of
@@ -191,6 +190,9 @@ def _image_rows(
             points = _keypoints(context, image.image_id)
             found.keypoints[image.image_id] = None if points is None else len(points)
         keypoints, seen = found.keypoints[image.image_id], found.seen.get(image.image_id)
+        coverage = None
+        if keypoints is not None:
+            coverage = 0.0 if seen is None else float(seen.mean())
         images.append(
             ImageRow(
                 image_id=image.image_id,
@@ -201,7 +203,7 @@ def _image_rows(
                 pairs=proposed[image.image_id],
                 verified_pairs=tied[image.image_id],
                 verified_matches=matches[image.image_id],
-                coverage=None if keypoints is None else 0.0 if seen is None else float(seen.mean()),
+                coverage=coverage,
                 views=_fact([one.views(image.image_id) for one in made_in], "views", len),
                 shadow=_fact([one.enhanced(image.image_id, ".json") for one in made_in], "shadow_share", float),
                 **dict(zip(_SPREAD, spread.get(image.image_id, ()), strict=False)),

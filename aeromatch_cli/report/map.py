@@ -113,11 +113,7 @@ def block_map(
     placed = [link for link in links if link.image_id0 in place and link.image_id1 in place]
     drawn = [placed[i] for i in evenly_chosen(len(placed), MAX_LINES)]
     outlines = [footprints[i] for i in evenly_chosen(len(footprints), MAX_FOOTPRINTS)]
-    remarks = [
-        f"{len(shown):,} of {len(known):,} {words} are drawn, evenly chosen."
-        for shown, known, words in ((drawn, placed, "pair lines"), (outlines, footprints, "footprints"))
-        if len(shown) < len(known)
-    ]
+    remarks = [*_of_all(drawn, placed, "pair lines"), *_of_all(outlines, footprints, "footprints")]
     if missing := len(links) - len(placed):
         words = "1 pair has an image" if missing == 1 else f"{missing:,} pairs have images"
         remarks.append(f"Not drawn: {words} without position.")
@@ -126,13 +122,7 @@ def block_map(
     _draw_footprints(axes, outlines)
     limits = match_classes(link.verified for link in placed if link.state == "verified")
     titles, handles = _draw_links(axes, place, drawn, limits)
-    diameter = 6.4 if len(stations) <= 200 else 3.6 if len(stations) <= 2000 else 2.1
-    for kind, (words, style) in _CAMERAS.items():
-        if members := [s for s in stations if s.kind == kind]:
-            places = np.array([place[s.image_id] for s in members])
-            area = diameter**2 * (1.0 if kind == "fine" else 2.0)
-            handles.append(axes.scatter(*places.T, area, label=words, gid=kind, zorder=4, **style))
-            titles[kind] = [s.title for s in members]
+    _draw_cameras(axes, stations, titles, handles)
     axes.figure.legend(
         handles=handles, loc="upper right", alignment="left", frameon=False, title="Verified matches per pair"
     )
@@ -141,6 +131,30 @@ def block_map(
     if sketch is not None:
         _draw_sketch(axes, sketch)
     return MapFigure(svg(axes.figure, "Block map", "map", titles), tuple(remarks))
+
+
+def _of_all(shown: Sequence[Any], known: Sequence[Any], words: str) -> list[str]:
+    """Return a remark where only some of many things are drawn."""
+    if len(shown) == len(known):
+        return []
+    return [f"{len(shown):,} of {len(known):,} {words} are drawn, evenly chosen."]
+
+
+def _draw_cameras(axes: Any, stations: Sequence[Station], titles: dict[str, list[str]], handles: list[Any]) -> None:
+    """Draw the cameras kind by kind, and add their titles and what the legend shows of them. Many are drawn small."""
+    diameter = 2.1
+    if len(stations) <= 200:
+        diameter = 6.4
+    elif len(stations) <= 2000:
+        diameter = 3.6
+    for kind, (words, style) in _CAMERAS.items():
+        members = [station for station in stations if station.kind == kind]
+        if not members:
+            continue
+        places = np.array([(station.x_m, station.y_m) for station in members])
+        area = diameter**2 * (1.0 if kind == "fine" else 2.0)
+        handles.append(axes.scatter(*places.T, area, label=words, gid=kind, zorder=4, **style))
+        titles[kind] = [station.title for station in members]
 
 
 def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> Any:

@@ -18,7 +18,7 @@ from aeromatch_cli.config import dump
 from aeromatch_cli.data import AdjustedBlock, FloatArray
 from aeromatch_cli.files import write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
-from aeromatch_cli.formats.refined import read_final_keypoints
+from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.report.adjustment import (
     PRINCIPAL_POINT,
@@ -160,15 +160,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         block=_block_facts(context, in_world=adjustment.in_world),
         map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),
         fields=_ground_figures(context, adjusted, in_world=adjustment.in_world),
-        histograms=[
-            histogram(counts, f"verified matches per {words}", unit)
-            for counts, words, unit in (
-                ([row.verified for row in pairs if row.state == "verified"], "verified pair", "pairs"),
-                ([row.verified_matches for row in images], "image", "images"),
-            )
-            if any(counts)
-        ]
-        + point_figures(adjusted),
+        histograms=[*_histograms(images, pairs), *point_figures(adjusted)],
         evaluation=evaluation_figures(context.workspace),
         previews=previews(context, pairs),
         error_limits_px=ERROR_LIMITS_PX,
@@ -186,6 +178,18 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         stages=stages,
         settings=_settings_text(context),
     )
+
+
+def _histograms(images: Sequence[ImageRow], pairs: Sequence[PairRow]) -> list[str]:
+    """Draw how many verified matches pairs and images have; nothing where none has any."""
+    of_pairs = [row.verified for row in pairs if row.state == "verified"]
+    of_images = [row.verified_matches for row in images]
+    figures = []
+    if any(of_pairs):
+        figures.append(histogram(of_pairs, "verified matches per verified pair", "pairs"))
+    if any(of_images):
+        figures.append(histogram(of_images, "verified matches per image", "images"))
+    return figures
 
 
 def _quality(context: Context, adjustment: Adjustment) -> Quality | None:

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ItemError, WorkspaceError
-from aeromatch_cli.formats.features import read_keypoints
-from aeromatch_cli.formats.refined import checked_final_keypoints
+from aeromatch_cli.formats.features import checked_final_keypoints, read_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import read_pixels

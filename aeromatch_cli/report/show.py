@@ -8,12 +8,12 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from aeromatch_cli import graph
-from aeromatch_cli.data import Image, Pose
+from aeromatch_cli.data import BoolArray, Image, Pose, Verdict
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.archives import ARCHIVE_FAULTS
@@ -27,6 +27,7 @@ from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult
+from aeromatch_cli.sfm.quality.finding import Quality
 from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.inspect_image import steps_of_image
 from aeromatch_cli.stages.quality import quality_on_file
@@ -101,48 +102,69 @@ def show(
 
 
 def _workspace(work: _Work) -> Shown:
-    workspace, lines = work.workspace, []
-    attitudes = sum(pose.world_rotation is not None for pose in work.poses.values())
-    lines.append(f"images      {len(work.images)}, {len(work.poses)} with position, {attitudes} with attitude")
-    block = read_json(workspace.block)
-    scale = "" if block.get("metric", True) else ", of arbitrary scale"
-    lines.append(f"world       {block['crs']}{scale}, origin {' '.join(f'{v:.0f}' for v in block['origin_m'])}")
-    lines.append(f"pairs       {len(work.pairs)}")
-    stages, seconds = dict[str, Any](), seconds_by_stage(workspace)
-    for stage in graph.ORDER:
-        path = workspace.stage_report(stage)
-        if path.is_file():
-            found = stages[stage] = read_json(path)
-            lines.append(f"{stage:<11} {found['items']} items, {found['failed']} failed, {seconds[stage]:.1f} s")
-            match graph.BY_NAME[stage].result.of_json(found.get("result")):
-                case FilterResult() as judged:
-                    states = ", ".join(f"{count} {state}" for state, count in judged.pairs.items())
-                    lines.append(f"            {states}; {judged.verified_matches} verified matches")
-                case ConsistencyResult(verified_matches=int(left)) as final:
-                    when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
-                    dropped = f"{final.dropped_matches} of them dropped, {final.rejected_pairs} pairs rejected"
-                    lines.append(f"            {dropped}; {left} are left{when}")
-    exported = result_on_file(workspace, ExportResult)
-    written = set() if exported is None else set(exported.exporters)
-    older = ", of an earlier adjustment: run aeromatch export" if workspace.export_is_older else ""
-    lines += [
-        f"export      {one}{older if one.name in written else ' (of an earlier run)'}" for one in workspace.exported()
-    ]
+    """Show a workspace as a whole: its block, stages, exports and verdict."""
+    workspace = work.workspace
+    quality = quality_on_file(workspace, work.names)
+    lines = [*_block_lines(work), *_stage_lines(workspace), *_export_lines(workspace)]
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
-    facts: dict[str, Any] = {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)}
-    quality = quality_on_file(workspace, work.names)
-    if quality is not None:
-        first, *others = [one.sentence for one in quality.faults] or ["nothing speaks against it"]
-        lines += [f"result      {quality.verdict}: {first}", *(f"            {words}" for words in others)]
-        lines += [f"            not checked: {'; '.join(quality.unchecked)}"] if quality.unchecked else []
-        facts["quality"] = quality.as_facts()
-    elif "adjust" in stages and result_on_file(workspace, AdjustResult) is None:
-        lines.append("result      of an earlier version of aeromatch: run `aeromatch run` again for the verdict")
+    lines += _verdict_lines(workspace, quality)
     if workspace.report.is_file():
         lines.append(f"report      {workspace.report}")
     lines.append("one image: aeromatch show WORK IMAGE; a pair: aeromatch show WORK IMAGE IMAGE")
+    facts: dict[str, Any] = {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)}
+    if quality is not None:
+        facts["quality"] = quality.as_facts()
     return Shown(lines, facts)
+
+
+def _block_lines(work: _Work) -> Iterator[str]:
+    attitudes = sum(pose.world_rotation is not None for pose in work.poses.values())
+    yield f"images      {len(work.images)}, {len(work.poses)} with position, {attitudes} with attitude"
+    block = read_json(work.workspace.block)
+    scale = "" if block.get("metric", True) else ", of arbitrary scale"
+    yield f"world       {block['crs']}{scale}, origin {' '.join(f'{v:.0f}' for v in block['origin_m'])}"
+    yield f"pairs       {len(work.pairs)}"
+
+
+def _stage_lines(workspace: Workspace) -> Iterator[str]:
+    """Say what every stage that has run made, and the counts of matches that were verified and that are left."""
+    seconds = seconds_by_stage(workspace)
+    for stage in graph.ORDER:
+        path = workspace.stage_report(stage)
+        if not path.is_file():
+            continue
+        found = read_json(path)
+        yield f"{stage:<11} {found['items']} items, {found['failed']} failed, {seconds[stage]:.1f} s"
+        match graph.BY_NAME[stage].result.of_json(found.get("result")):
+            case FilterResult() as judged:
+                states = ", ".join(f"{count} {state}" for state, count in judged.pairs.items())
+                yield f"            {states}; {judged.verified_matches} verified matches"
+            case ConsistencyResult(verified_matches=int(left)) as final:
+                when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
+                dropped = f"{final.dropped_matches} of them dropped, {final.rejected_pairs} pairs rejected"
+                yield f"            {dropped}; {left} are left{when}"
+
+
+def _export_lines(workspace: Workspace) -> Iterator[str]:
+    exported = result_on_file(workspace, ExportResult)
+    written = set() if exported is None else set(exported.exporters)
+    older = ", of an earlier adjustment: run aeromatch export" if workspace.export_is_older else ""
+    for one in workspace.exported():
+        yield f"export      {one}{older if one.name in written else ' (of an earlier run)'}"
+
+
+def _verdict_lines(workspace: Workspace, quality: Quality | None) -> Iterator[str]:
+    if quality is None:
+        if workspace.stage_report("adjust").is_file() and result_on_file(workspace, AdjustResult) is None:
+            yield "result      of an earlier version of aeromatch: run `aeromatch run` again for the verdict"
+        return
+    first, *others = [one.sentence for one in quality.faults] or ["nothing speaks against it"]
+    yield f"result      {quality.verdict}: {first}"
+    for sentence in others:
+        yield f"            {sentence}"
+    if quality.unchecked:
+        yield f"            not checked: {'; '.join(quality.unchecked)}"
 
 
 def _stale(work: _Work) -> str:
@@ -155,37 +177,19 @@ def _stale(work: _Work) -> str:
 
 
 def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown:
+    """Show an image: its camera, poses, keypoints and partners, and a picture of its keypoints."""
     workspace, image_id = work.workspace, image.image_id
-    camera, pose = work.cameras[image.camera_id], work.poses.get(image_id)
+    camera = work.cameras[image.camera_id]
     lines = [f"image       {image.name}, {image.width_px} x {image.height_px} px, id {image_id}"]
     lines.append(f"camera      {image.camera_id}: {camera.model} {' '.join(f'{v:.6g}' for v in corner_params(camera))}")
-    world = read_json(workspace.block)
-    origin_m, metric = world["origin_m"], world.get("metric", True)  # those of earlier versions do not say
-    adjusted = work.adjusted.poses.get(image_id) if work.adjusted is not None else None
-    lines += [f"pose        {words}" for words in _pose_words(pose, origin_m, metric=metric)]
-    if adjusted is not None:
-        sigmas = float(np.mean(adjusted.sigmas_m)), float(np.mean(adjusted.sigmas_deg))
-        known = Pose(adjusted.center_m, adjusted.rotation, *sigmas)
-        placed = image_id not in work.adjusted.frames if work.adjusted is not None else metric
-        lines += [f"adjusted    {words}" for words in _pose_words(known, origin_m, metric=placed)]
+    lines += _pose_lines(work, image_id)
     keypoints = work.keypoints_px(image_id)
-    rows = []
-    matched = np.zeros(len(keypoints), dtype=bool)
-    for pair in work.pairs:
-        if image_id not in (pair.image_id0, pair.image_id1):
-            continue
-        other = work.images[pair.image_id1 if pair.image_id0 == image_id else pair.image_id0]
-        found = work.final(pair)
-        count = len(found.matches.indices) if found is not None and found.verdict.state == "verified" else 0
-        if count and found is not None:
-            own = found.matches.indices[:, 0 if pair.image_id0 == image_id else 1]
-            matched[own[own >= 0]] = True
-        rows.append((count, other.name, found.verdict.state if found is not None else "not judged", pair.overlap))
+    partners, matched = _partners(work, image_id, len(keypoints))
+    verified = sum(partner.matches > 0 for partner in partners)
     lines.append(f"keypoints   {len(keypoints)}, {int(matched.sum())} of them in verified matches")
-    lines.append(f"partners    {len(rows)}, {sum(count > 0 for count, *_ in rows)} of them verified")
-    for count, name, state, overlap in sorted(rows, key=lambda row: (-row[0], row[1]))[:_LISTED]:
-        share = "overlap unknown" if np.isnan(overlap) else f"overlap {100 * overlap:.0f} %"
-        lines.append(f"            {name}: {count} matches, {state}, {share}")
+    lines.append(f"partners    {len(partners)}, {verified} of them verified")
+    for partner in sorted(partners, key=lambda one: (-one.matches, one.name))[:_LISTED]:
+        lines.append(f"            {partner.words}")
     for made in makers(work.settings, workspace):
         for what, path in (("enhanced", made.enhanced(image_id, ".png")), ("views", made.views(image_id))):
             if path.exists():
@@ -198,9 +202,57 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     write_tiles(target, tiles, lines, image.name)
     also = f"; {', '.join(tile.title for tile in tiles[1:])}" if views else ""
     lines.append(f"picture     {target}: keypoints in verified matches green, others pale{also}")
-    partners = {name: count for count, name, *_ in rows}
-    facts = {"image": image.name, "keypoints": len(keypoints), "partners": partners, "picture": str(target)}
+    matches = {partner.name: partner.matches for partner in partners}
+    facts = {"image": image.name, "keypoints": len(keypoints), "partners": matches, "picture": str(target)}
     return Shown(lines, facts, target)
+
+
+def _pose_lines(work: _Work, image_id: str) -> Iterator[str]:
+    """Say the pose of an image as it is known, and as it was adjusted."""
+    world = read_json(work.workspace.block)
+    origin_m, metric = world["origin_m"], world.get("metric", True)  # those of earlier versions do not say
+    for words in _pose_words(work.poses.get(image_id), origin_m, metric=metric):
+        yield f"pose        {words}"
+    if work.adjusted is None or image_id not in work.adjusted.poses:
+        return
+    adjusted = work.adjusted.poses[image_id]
+    sigmas = float(np.mean(adjusted.sigmas_m)), float(np.mean(adjusted.sigmas_deg))
+    known = Pose(adjusted.center_m, adjusted.rotation, *sigmas)
+    for words in _pose_words(known, origin_m, metric=image_id not in work.adjusted.frames):
+        yield f"adjusted    {words}"
+
+
+class _Partner(NamedTuple):
+    """An image that is paired with another. matches: verified ones that are left. state: of the pair."""
+
+    name: str
+    matches: int
+    state: str
+    overlap: float
+
+    @property
+    def words(self) -> str:
+        share = "overlap unknown" if np.isnan(self.overlap) else f"overlap {100 * self.overlap:.0f} %"
+        return f"{self.name}: {self.matches} matches, {self.state}, {share}"
+
+
+def _partners(work: _Work, image_id: str, keypoints: int) -> tuple[list[_Partner], BoolArray]:
+    """Return the images that an image is paired with, and which of its keypoints (K,) are in verified matches."""
+    partners, matched = [], np.zeros(keypoints, dtype=bool)
+    for pair in work.pairs:
+        ids = pair.image_id0, pair.image_id1
+        if image_id not in ids:
+            continue
+        side = ids.index(image_id)
+        name = work.images[ids[1 - side]].name
+        found = work.final(pair)
+        if found is None:
+            partners.append(_Partner(name, 0, "not judged", pair.overlap))
+            continue
+        own = found.matches.indices[:, side] if found.verdict.state == "verified" else np.zeros(0, np.int32)
+        matched[own[own >= 0]] = True
+        partners.append(_Partner(name, len(own), found.verdict.state, pair.overlap))
+    return partners, matched
 
 
 def _own_file(workspace: Workspace, name: str) -> Path:
@@ -224,50 +276,63 @@ def _pose_words(pose: Pose | None, origin_m: Sequence[float], *, metric: bool) -
 
 
 def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, rejected: bool) -> Shown:
+    """Show a pair: how its matches were verified, and a picture of them."""
     workspace, ids = work.workspace, (image0.image_id, image1.image_id)
     pair = next((p for p in work.pairs if (p.image_id0, p.image_id1) == ids), None)
     if pair is None:
         raise InputError(
             f"{image0.name} and {image1.name} are not paired in {workspace.root}: pairs.csv lists the pairs"
         )
-    lines = [f"pair        {image0.name} and {image1.name}, paired by {pair.reason}"]
-    if not np.isnan(pair.overlap):
-        lines.append(f"overlap     {100 * pair.overlap:.0f} %, view angle {pair.view_angle_deg:.1f} degrees")
     found, raw = work.final(pair), work.matches(pair)
     if found is None or raw is None:
         raise InputError(f"{image0.name} and {image1.name} have no matches on file: run aeromatch match and filter")
+    lines = [f"pair        {image0.name} and {image1.name}, paired by {pair.reason}"]
+    if not np.isnan(pair.overlap):
+        lines.append(f"overlap     {100 * pair.overlap:.0f} %, view angle {pair.view_angle_deg:.1f} degrees")
     verdict = found.verdict
     kept = found.matches if verdict.state == "verified" else None
     count = 0 if kept is None else len(kept.indices)
     lines.append(f"matches     {len(raw.matches.indices)} by {raw.strategy}, {count} verified: {verdict.state}")
-    if verdict.reason:
-        lines.append(f"            {verdict.reason}")
-    lines += [f"dropped     {number} by {name}" for name, number in verdict.rejected.items() if number]
-    errors = verdict.errors_px
-    if errors is not None and len(errors):
-        low, middle, high = np.nanpercentile(errors, [5, 50, 95])
-        lines.append(f"errors      median {middle:.2f} px, 90 % between {low:.2f} and {high:.2f} px")
-    if workspace.steps.is_file():
-        row = next((r for r in read_csv(workspace.steps) if (r["image_id0"], r["image_id1"]) == ids), None)
-        if row is not None:
-            lines.append(f"steps       {row['steps']}{': ' + row['reasons'] if row['reasons'] else ''}")
+    lines += [*_verdict_of_pair(verdict), *_pass_lines(workspace, ids)]
     sides = [work.keypoints_px(i) for i in ids]
     points = match_points(kept, *sides) if kept is not None else (np.zeros((0, 2)), np.zeros((0, 2)))
     dropped = match_points(raw.matches, *sides) if rejected or kept is None else None
-    pixels = [read_pixels(work.picture(image), colour=True) for image in (image0, image1)]
     target = out or _own_file(workspace, f"{ids[0]}--{ids[1]}.png")
     words = f"green to yellow by error{', dropped ones red' if dropped is not None else ''}"
-    tiles = [Tile(f"matches: {words}", pair_picture(pixels, points, errors, dropped))]
-    if target.suffix.lower() != ".png":
-        laid = aligned(pixels, points)
-        if laid is None and target.suffix.lower() == ".gif":
-            raise InputError(f"{image0.name} and {image1.name} have too few matches to lay them on each other")
-        tiles += [laid] if laid is not None else []
-        words = tiles[-1].title if target.suffix.lower() == ".gif" else f"{words}; {tiles[-1].title}"
-    write_tiles(target, tiles, lines, f"{image0.name} and {image1.name}")
+    pixels = [read_pixels(work.picture(image), colour=True) for image in (image0, image1)]
+    tiles = [Tile(f"matches: {words}", pair_picture(pixels, points, verdict.errors_px, dropped))]
+    kind, both = target.suffix.lower(), f"{image0.name} and {image1.name}"
+    laid = aligned(pixels, points) if kind != ".png" else None
+    if laid is not None:
+        tiles.append(laid)
+    elif kind == ".gif":
+        raise InputError(f"{both} have too few matches to lay them on each other")
+    write_tiles(target, tiles, lines, both)
+    if kind != ".png":
+        words = tiles[-1].title if kind == ".gif" else f"{words}; {tiles[-1].title}"
     lines.append(f"picture     {target}: {words}")
     facts = {"pair": [image0.name, image1.name], "verified": count, "state": verdict.state, "picture": str(target)}
     return Shown(lines, facts, target)
+
+
+def _verdict_of_pair(verdict: Verdict) -> Iterator[str]:
+    """Say why matches of a pair were dropped, and how large the errors of the others are."""
+    if verdict.reason:
+        yield f"            {verdict.reason}"
+    for name, number in verdict.rejected.items():
+        if number:
+            yield f"dropped     {number} by {name}"
+    if verdict.errors_px is not None and len(verdict.errors_px):
+        low, middle, high = np.nanpercentile(verdict.errors_px, [5, 50, 95])
+        yield f"errors      median {middle:.2f} px, 90 % between {low:.2f} and {high:.2f} px"
+
+
+def _pass_lines(workspace: Workspace, ids: tuple[str, str]) -> Iterator[str]:
+    """Say which steps of a cascade a pair took, and why."""
+    rows = read_csv(workspace.steps) if workspace.steps.is_file() else []
+    row = next((row for row in rows if (row["image_id0"], row["image_id1"]) == ids), None)
+    if row is not None:
+        yield f"steps       {row['steps']}{': ' + row['reasons'] if row['reasons'] else ''}"
 
 
 def _file_lines(path: Path) -> Iterator[str]:
@@ -299,6 +364,11 @@ def _stated(path: Path) -> Any:
 
 
 def _range(array: Any) -> str:
-    if array.dtype.kind not in "fiu" or not array.size:
-        return f", {', '.join(map(str, array.ravel()[:3]))}" if array.size and array.dtype.kind == "U" else ""
-    return f", {np.nanmin(array):.6g} to {np.nanmax(array):.6g}"
+    """Return the range of an array of numbers, the first values of one of text."""
+    if not array.size:
+        return ""
+    if array.dtype.kind in "fiu":
+        return f", {np.nanmin(array):.6g} to {np.nanmax(array):.6g}"
+    if array.dtype.kind == "U":
+        return f", {', '.join(map(str, array.ravel()[:3]))}"
+    return ""

@@ -90,16 +90,14 @@ def refine(folder: Path) -> None:
         group = waiting.popleft()
         free = not task["fixed"]
         observed = given if group["kind"] != "level" else given.without_positions()
-        model = _posed(work, folder, set(group["images"]))
-        for number in held:
-            set_lens(pycolmap, model.cameras[number], work.lenses[number], number in work.fisheyes)
+        model = _posed(work, folder, set(group["images"]), held)
         model = _triangulated(pycolmap, model, folder, rough=free)
         if free and group["kind"] != "given":
             parts = connected_parts(model)
             if not parts:
                 continue
             keep_images(model, parts[0])
-            waiting.extend({**group, "images": part} for part in parts[1:] if len(part) >= _FEWEST_IMAGES)
+            waiting.extend(_groups_of(group, parts[1:]))
         attitudes = _attitudes(model, given) if group["kind"] == "given" else ()
         registered: list[int] = []
         outcome: Outcome | None = None
@@ -111,18 +109,13 @@ def refine(folder: Path) -> None:
                 model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
             inside = surveyed if group["kind"] != "level" else []
             model, outcome, control = _refined(work, folder, model, group["kind"], observed, attitudes, held, inside)
-        intersect(work, model, observed)
-        _once_per_image(model)
-        _drop_weak_points(model)
-        drop_weak_images(model)
+        _clean(work, model, observed)
         if not image_numbers(model):
             continue
         lenses = {n: work.lens(model, n) for n in images_by_camera(model)}
         held |= lenses.keys()
         name = f"model{len(models)}.npz"
-        deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
-        sweeps_m = _sweeps_m(model, given, lenses)
-        np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations, sweeps_m=sweeps_m)
+        _write_model(folder / name, model, lenses, given, outcome)
         result = GroupResult(
             kind=group["kind"], registered=[*map(names.image, registered)], control=control, **figures(model)
         )
@@ -130,6 +123,28 @@ def refine(folder: Path) -> None:
             result = adjusted_group(result, outcome, observed, names)
         models.append({"file": name, "result": result.as_json()})
     (folder / "result.json").write_text(json.dumps({"models": models}), encoding="utf-8")
+
+
+def _groups_of(group: dict[str, Any], parts: Sequence[Collection[int]]) -> list[dict[str, Any]]:
+    """Return the groups that parts of a group become, without parts of few images."""
+    return [{**group, "images": part} for part in parts if len(part) >= _FEWEST_IMAGES]
+
+
+def _clean(work: Work, model: Any, observed: Given) -> None:
+    """Place the points of an adjusted model, and drop points and images that too little holds."""
+    intersect(work, model, observed)
+    _once_per_image(model)
+    _drop_weak_points(model)
+    drop_weak_images(model)
+
+
+def _write_model(
+    path: Path, model: Any, lenses: Mapping[int, FloatArray], given: Given, outcome: Outcome | None
+) -> None:
+    """Write poses, points, tracks and standard deviations of a model. lenses: by number of a camera."""
+    deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
+    sweeps_m = _sweeps_m(model, given, lenses)
+    np.savez(path, **arrays(model, lenses), **tracks_of(model), **deviations, sweeps_m=sweeps_m)
 
 
 def _hold_all_that_adjusts(work: Work, folder: Path) -> None:
@@ -167,7 +182,8 @@ def _joined_groups(work: Work, folder: Path, groups: Sequence[dict[str, Any]]) -
     """Groups of which those that final matches tie are one; the poses on file are moved with them."""
     pycolmap, parts = work.pycolmap, []
     for group in sorted(groups, key=lambda one: (one["kind"] == "level", -len(one["images"]))):
-        model = _triangulated(pycolmap, _posed(work, folder, set(group["images"])), folder, rough=True)
+        posed = _posed(work, folder, set(group["images"]), held=())
+        model = _triangulated(pycolmap, posed, folder, rough=True)
         parts.append(_part(group["kind"], model))
     with pycolmap.Database.open(folder / "database.db") as opened:
         seen = zip(*opened.read_two_view_geometries(), strict=True)
@@ -244,13 +260,15 @@ def _refined(
     return model, outcome, control
 
 
-def _posed(work: Work, folder: Path, numbers: set[int]) -> Any:
-    """The given poses of some images."""
+def _posed(work: Work, folder: Path, numbers: set[int], held: Collection[int]) -> Any:
+    """Return a model of the given poses of some images. held: cameras whose lens has been found before."""
     model = work.pycolmap.Reconstruction(folder / "sparse")
     work.start(model)
     for image in list(model.images.values()):
         if image.has_pose and image.image_id not in numbers:
             model.deregister_frame(image.frame_id)
+    for number in held:
+        set_lens(work.pycolmap, model.cameras[number], work.lenses[number], number in work.fisheyes)
     return model
 
 

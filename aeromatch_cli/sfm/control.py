@@ -35,28 +35,16 @@ def control_figures(
     three control points residuals are those of the block as it is.
     """
     rays = {point.name: _rays(adjusted, cameras, point) for point in points}
-    found = {point.name: intersected(*rays[point.name]) for point in points}
-    in_block = {
-        point.name: place
-        for point in points
-        if (place := found[point.name]) is not None
-        and len(_pixel_moves(adjusted, cameras, point, place)) >= _LEAST_RAYS
-    }
+    in_block = _in_block(adjusted, cameras, points, rays)
     seen = [point for point in points if point.name in in_block]
     control = [point for point in seen if not point.check]
     checks = [point for point in seen if point.check]
     fit = _fit(control, in_block) if _determine_similarity(control, in_block) else None
-    image_residuals = {p.name: _image_residuals(adjusted, cameras, p, in_block[p.name]) for p in seen}
     result = Control(
         points=len(points),
         control=len(control),
         check=len(checks),
-        not_measured_in_two_images=sorted(name for name, (_, directions) in rays.items() if len(directions) < 2),
-        rays_do_not_meet=sorted(
-            name for name, (_, directions) in rays.items() if len(directions) > 1 and name not in in_block
-        ),
-        image_residuals_px=image_residuals,
-        reprojection_error_px=_rms_length([one for own in image_residuals.values() for one in own.values()]),
+        **_figures_in_images(adjusted, cameras, seen, rays, in_block),
     )
     if seen and (metric or fit is not None):
         result = result.model_copy(update=_residuals(adjusted, cameras, [*control, *checks], in_block, fit))
@@ -74,6 +62,39 @@ def control_figures(
             "doubtful": _doubtful(control, in_block),
         }
     )
+
+
+def _figures_in_images(
+    adjusted: AdjustedBlock,
+    cameras: Mapping[str, Camera],
+    seen: Sequence[ControlPoint],
+    rays: Mapping[str, tuple[FloatArray, FloatArray]],
+    in_block: Mapping[str, FloatArray],
+) -> dict[str, Any]:
+    """Return fields of Control: points that their images do not determine, and residuals in images of those seen."""
+    in_images = {name: len(directions) for name, (_, directions) in rays.items()}
+    residuals_px = {p.name: _image_residuals(adjusted, cameras, p, in_block[p.name]) for p in seen}
+    return {
+        "not_measured_in_two_images": sorted(name for name, count in in_images.items() if count < 2),
+        "rays_do_not_meet": sorted(name for name, count in in_images.items() if count > 1 and name not in in_block),
+        "image_residuals_px": residuals_px,
+        "reprojection_error_px": _rms_length([one for own in residuals_px.values() for one in own.values()]),
+    }
+
+
+def _in_block(
+    adjusted: AdjustedBlock,
+    cameras: Mapping[str, Camera],
+    points: Sequence[ControlPoint],
+    rays: Mapping[str, tuple[FloatArray, FloatArray]],
+) -> dict[str, FloatArray]:
+    """Return name -> place (3,) in the block of the points that enough image coordinates determine. rays: by name."""
+    found = {}
+    for point in points:
+        place = intersected(*rays[point.name])
+        if place is not None and len(_pixel_moves(adjusted, cameras, point, place)) >= _LEAST_RAYS:
+            found[point.name] = place
+    return found
 
 
 _Fit = tuple[float, FloatArray, FloatArray]

@@ -2,12 +2,13 @@
 
 A control point is a point of the network whose coordinates are observed with their standard deviations, as are its
 image points. Positions of the images keep their shape: what all of a flight have in common (another geoid, another
-base station) is an unknown then, so that control and positions do not fight for the datum.
+base station) is an unknown then, so that control and positions do not fight for the datum. Where a list as a whole does
+not fit the block, `fault_of_list` looks for what is wrong with it: a unit, exchanged axes, a sign.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +23,6 @@ from aeromatch_cli.sfm.bundle.normal_equations import cost
 from aeromatch_cli.sfm.bundle.solve import solve
 from aeromatch_cli.sfm.calibration import camera_of
 from aeromatch_cli.sfm.control import intersected
-from aeromatch_cli.sfm.control_faults import fault_of_list
 from aeromatch_cli.sfm.model_adjustment import Outcome, Work, take_outcome
 
 # Control points farther from the block than this, metres, are in another coordinate system.
@@ -36,6 +36,24 @@ _CONTRADICTING, _TOLD = 4.0, 3.0
 _TELLING = 4
 # An adjustment that starts from the solution of nearly the same network ends when a step lowers the cost by less.
 _TOLERANCE = 1e-4
+# So many points tell.
+_LEAST_POINTS = 3
+# A fault explains the list where points lie nearer by this factor with it put right, and so near in units of their
+# extent.
+_EXPLAINED, _FITTING = 10.0, 0.01
+_FOOT_M = 0.3048
+_X, _Y, _Z = np.eye(3)
+# What a list may have -> coordinates as they should be, by those that it has.
+_FAULTS: tuple[tuple[str, FloatArray], ...] = (
+    ("their x and y are exchanged", np.array([_Y, _X, _Z])),
+    ("they are in feet, not in metres", _FOOT_M * np.eye(3)),
+    ("they are in metres and were taken as feet", np.eye(3) / _FOOT_M),
+    ("their x and y are in feet, not in metres", np.diag([_FOOT_M, _FOOT_M, 1.0])),
+    ("their heights are in feet, not in metres", np.diag([1.0, 1.0, _FOOT_M])),
+    ("their x has the other sign", np.diag([-1.0, 1.0, 1.0])),
+    ("their y has the other sign", np.diag([1.0, -1.0, 1.0])),
+    ("their heights have the other sign", np.diag([1.0, 1.0, -1.0])),
+)
 
 
 @dataclass(frozen=True)
@@ -74,42 +92,23 @@ def with_control(
     images = set(outcome.images)
     base = _Block(outcome.result.network, outcome.result.state, outcome)
     seen = [point for point in surveyed if point.seen_by(images) >= 2 and np.isfinite(base.error_m(point)).all()]
-    control, checks = [p for p in seen if not p.check], [p for p in seen if p.check]
     if not seen:
         return outcome, None
-    without_m = np.array([base.error_m(point) for point in seen])
-    offset_m = np.median(without_m, axis=0)
+    control, checks = [p for p in seen if not p.check], [p for p in seen if p.check]
+    without_m = {point.name: base.error_m(point) for point in seen}
+    errors_m = np.array(list(without_m.values()))
+    offset_m = np.median(errors_m, axis=0)
     stated_m = np.array([point.position_m for point in seen])
-    fault = fault_of_list(stated_m + without_m, stated_m)
+    fault = fault_of_list(stated_m + errors_m, stated_m)
     if not control or fault or float(np.abs(offset_m).max()) > _FAR_M:
-        as_it_is = _rms(without_m[[seen.index(point) for point in checks]]) if checks else None
-        return outcome, ControlInGroup(
-            used=[],
-            wrong=[],
-            exchanged=[],
-            fault=fault,
-            held_out="check points",
-            held_out_rms_m=as_it_is,
-            without_rms_m=as_it_is,
-            kept=not control,
-        )
+        return outcome, _as_it_is(_errors(without_m, checks), fault, kept=not control)
     exchanged = _exchanged(base, control)
     used = [point for point in control if point.name not in exchanged]
-    wrong: list[str] = []
-    start = base.moved(-offset_m)
-    while True:
-        solved = start.adjusted(work, used)
-        rests = [solved.without([other for other in used if other is not point]) for point in used]
-        worst = _worst(solved, rests, len(used)) if len(used) >= _TELLING else None
-        if worst is None:
-            break
-        wrong.append(used.pop(worst).name)
-    errors_m = np.array([rest.error_m(point) for rest, point in zip(rests, used, strict=True)]).reshape(-1, 3)
+    solved, rests, used, wrong = _without_wrong(work, base.moved(-offset_m), used)
     held_out = checks or (used if len(used) > 1 else [])
-    held_out_m = np.array([solved.error_m(point) for point in checks]) if checks else errors_m
-    before_m = without_m[[seen.index(point) for point in held_out]] if held_out else np.zeros((0, 3))
-    sound = bool(np.isfinite(solved.state.centers_m).all())
-    kept = sound and (not held_out or _size(held_out_m) <= _size(before_m))
+    held_out_m = _held_out_errors_m(solved, rests, used, checks)
+    before_m = _errors(without_m, held_out)
+    kept = _is_as_good(solved, held_out_m, before_m)
     found = ControlInGroup(
         used=[point.name for point in used] if kept else [],
         wrong=wrong,
@@ -125,6 +124,62 @@ def with_control(
     taken = replace(outcome, result=replace(solved.outcome.result, stated=outcome.result.stated))
     take_outcome(work, model, taken)
     return taken, found
+
+
+def _errors(errors_m: Mapping[str, FloatArray], points: Sequence[Surveyed]) -> FloatArray:
+    """Return the errors (N, 3) of some points. errors_m: by name of a point, (3,) each."""
+    return np.array([errors_m[point.name] for point in points]).reshape(-1, 3)
+
+
+def _is_as_good(solved: _Block, held_out_m: FloatArray, before_m: FloatArray) -> bool:
+    """Whether a block is whole and its errors (N, 3) at held-out points are no larger than before."""
+    if not np.isfinite(solved.state.centers_m).all():
+        return False
+    return not len(before_m) or _size(held_out_m) <= _size(before_m)
+
+
+def _held_out_errors_m(
+    solved: _Block, rests: Sequence[_Block], used: Sequence[Surveyed], checks: Sequence[Surveyed]
+) -> FloatArray:
+    """Return the errors (N, 3) at check points, without any at every control point in the block without it. rests: the
+    block without each point of `used`."""
+    if checks:
+        return np.array([solved.error_m(point) for point in checks])
+    errors_m = [rest.error_m(point) for rest, point in zip(rests, used, strict=True)]
+    return np.array(errors_m).reshape(-1, 3)
+
+
+def _as_it_is(check_errors_m: FloatArray, fault: str, *, kept: bool) -> ControlInGroup:
+    """Return what is known of control points that take no part, because they do not fit or because there are none.
+
+    check_errors_m: (N, 3) of the check points. fault: of the list. kept: whether the block lacks control points.
+    """
+    rms_m = _rms(check_errors_m)
+    return ControlInGroup(
+        used=[],
+        wrong=[],
+        exchanged=[],
+        fault=fault,
+        held_out="check points",
+        held_out_rms_m=rms_m,
+        without_rms_m=rms_m,
+        kept=kept,
+    )
+
+
+def _without_wrong(
+    work: Work, start: _Block, used: Sequence[Surveyed]
+) -> tuple[_Block, list[_Block], list[Surveyed], list[str]]:
+    """Return the block adjusted with control points, without each of them, those that are left, and those that
+    contradict the others: one after the other the worst is taken out."""
+    used, wrong = list(used), list[str]()
+    while True:
+        solved = start.adjusted(work, used)
+        rests = [solved.without([other for other in used if other is not point]) for point in used]
+        worst = _worst(solved, rests, len(used)) if len(used) >= _TELLING else None
+        if worst is None:
+            return solved, rests, used, wrong
+        wrong.append(used.pop(worst).name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,3 +292,25 @@ def _rms(errors_m: FloatArray) -> Xyz | None:
     if not len(errors_m) or not np.isfinite(errors_m).all():
         return None
     return xyz(np.round(np.sqrt((errors_m**2).mean(axis=0)), 4))
+
+
+def fault_of_list(found_m: FloatArray, stated_m: FloatArray) -> str:
+    """Return the fault that explains why points (N, 3) do not lie where they were surveyed, "" where none does.
+
+    found_m: where the block has them, metres. Whatever all have in common, such as another zero of heights, is no fault
+    of this kind.
+    """
+    if len(found_m) < _LEAST_POINTS:
+        return ""
+    as_it_is_m = _apart_m(found_m, stated_m)
+    extent_m = float(np.linalg.norm(np.ptp(found_m, axis=0)))
+    apart_m = [_apart_m(found_m, stated_m @ right.T) for _, right in _FAULTS]
+    best = int(np.argmin(apart_m))
+    explained = apart_m[best] * _EXPLAINED < as_it_is_m and apart_m[best] < _FITTING * extent_m
+    return _FAULTS[best][0] if explained and as_it_is_m > _FITTING * extent_m else ""
+
+
+def _apart_m(found_m: FloatArray, stated_m: FloatArray) -> float:
+    """Median distance, after what all have in common."""
+    off_m = found_m - stated_m
+    return float(np.median(np.linalg.norm(off_m - np.median(off_m, axis=0), axis=1)))

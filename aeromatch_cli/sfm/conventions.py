@@ -42,6 +42,28 @@ _MIN_IMAGES = 5
 # More images say no more of a convention.
 _MOST_IMAGES = 500
 _GON_DEG = 0.9
+# Kind of angles -> what may be wrong with them, the most usual first: the order in which the values are to be read, and
+# what each of these is to be multiplied by.
+_FAULTS: Mapping[str, tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]] = {
+    "yaw_pitch_roll": (
+        ("yaw counts counter-clockwise: change its sign", (0, 1, 2), (-1, 1, 1)),
+        ("pitch has the other sign", (0, 1, 2), (1, -1, 1)),
+        ("roll has the other sign", (0, 1, 2), (1, 1, -1)),
+        ("pitch and roll are exchanged", (0, 2, 1), (1, 1, 1)),
+        ("the angles are gon, not degrees", (0, 1, 2), (_GON_DEG,) * 3),
+        ("the angles are radians, not degrees", (0, 1, 2), (180.0 / np.pi,) * 3),
+    ),
+    "omega_phi_kappa": (
+        ("omega and phi are exchanged", (1, 0, 2), (1, 1, 1)),
+        ("kappa counts clockwise: change its sign", (0, 1, 2), (1, 1, -1)),
+        ("omega and phi have the other sign", (0, 1, 2), (-1, -1, 1)),
+        ("omega has the other sign", (0, 1, 2), (-1, 1, 1)),
+        ("phi has the other sign", (0, 1, 2), (1, -1, 1)),
+        ("the angles are gon, not degrees", (0, 1, 2), (_GON_DEG,) * 3),
+        ("the angles are radians, not degrees", (0, 1, 2), (180.0 / np.pi,) * 3),
+    ),
+    "quaternion": (("the quaternions are x, y, z, w, not w, x, y, z", (3, 0, 1, 2), (1, 1, 1, 1)),),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,30 +141,15 @@ def _readings(angles: list[Angles]) -> Iterator[tuple[str, Reading]]:
             f"pitch counts from {zero}: give --set block.angles={other}",
             lambda one: replace(one, forward=not one.forward).rotation,
         )
-        yield "yaw counts counter-clockwise: change its sign", lambda one: _changed(one, signs=(-1, 1, 1))
-        yield "pitch has the other sign", lambda one: _changed(one, signs=(1, -1, 1))
-        yield "roll has the other sign", lambda one: _changed(one, signs=(1, 1, -1))
-        yield "pitch and roll are exchanged", lambda one: _changed(one, order=(0, 2, 1))
-    elif kind == "omega_phi_kappa":
-        yield "omega and phi are exchanged", lambda one: _changed(one, order=(1, 0, 2))
-        yield "kappa counts clockwise: change its sign", lambda one: _changed(one, signs=(1, 1, -1))
-        yield "omega and phi have the other sign", lambda one: _changed(one, signs=(-1, -1, 1))
-        yield "omega has the other sign", lambda one: _changed(one, signs=(-1, 1, 1))
-        yield "phi has the other sign", lambda one: _changed(one, signs=(1, -1, 1))
-    else:
+    if kind == "quaternion":
         yield "the quaternions are camera to world, not world to camera", lambda one: one.rotation.T
-        yield "the quaternions are x, y, z, w, not w, x, y, z", lambda one: _changed(one, order=(3, 0, 1, 2))
-    if kind != "quaternion":
-        yield "the angles are gon, not degrees", lambda one: _changed(one, signs=(_GON_DEG,) * 3)
-        yield "the angles are radians, not degrees", lambda one: _changed(one, signs=(180.0 / np.pi,) * 3)
+    for words, order, factors in _FAULTS[kind]:
+        yield words, partial(_changed, order, factors)
 
 
-def _changed(
-    angles: Angles, signs: tuple[float, ...] | None = None, order: tuple[int, ...] | None = None
-) -> FloatArray:
-    values = angles.values if order is None else tuple(angles.values[k] for k in order)
-    if signs is not None:
-        values = tuple(sign * value for sign, value in zip(signs, values, strict=True))
+def _changed(order: tuple[int, ...], factors: tuple[float, ...], angles: Angles) -> FloatArray:
+    """Return the rotation (3, 3) of angles whose values are read in an order and multiplied by factors."""
+    values = tuple(factor * angles.values[k] for k, factor in zip(order, factors, strict=True))
     return replace(angles, values=values).rotation
 
 

@@ -163,18 +163,22 @@ def terrains_of(parts: Sequence[tuple[GroundPoints, FloatArray]]) -> tuple[Terra
     parts: of every group of images, its points and its projection centres (N, 3). Flights far apart in one grid would
     have cells as wide as a valley.
     """
-    flights: list[list[tuple[GroundPoints, FloatArray]]] = []
-    for part in parts:
-        near = [flight for flight in flights if any(_meet(part[1], other[1]) for other in flight)]
-        joined = [one for flight in near for one in flight]
-        flights = [flight for flight in flights if not any(flight is one for one in near)]
-        flights.append([*joined, part])
-    flights.sort(key=lambda flight: min(n for n, part in enumerate(parts) if any(part is one for one in flight)))
-    found = [
-        terrain_of(GroundPoints.joined([points for points, _ in flight]), np.concatenate([c for _, c in flight]))
-        for flight in flights
-    ]
-    return tuple(terrain for terrain in found if terrain is not None)
+    flights: list[list[int]] = []  # rows of parts
+    for row, (_, centers_m) in enumerate(parts):
+        joined, others = list[int](), list[list[int]]()
+        for flight in flights:
+            if any(_meet(centers_m, parts[one][1]) for one in flight):
+                joined += flight
+            else:
+                others.append(flight)
+        flights = [*others, [*joined, row]]
+    terrains = []
+    for flight in sorted(flights, key=min):
+        points = GroundPoints.joined([parts[row][0] for row in flight])
+        terrain = terrain_of(points, np.concatenate([parts[row][1] for row in flight]))
+        if terrain is not None:
+            terrains.append(terrain)
+    return tuple(terrains)
 
 
 def _meet(centers0_m: FloatArray, centers1_m: FloatArray) -> bool:

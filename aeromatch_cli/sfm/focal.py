@@ -58,7 +58,8 @@ def better_cameras(
         near = np.arange(-_OCTAVES, _OCTAVES + step, step) if step == _STEPS[0] else octaves + step * np.array([-1, 1])
         for tried in near:
             found = error(_scaled(cameras, 2.0 ** float(tried)))
-            best, octaves = (found, float(tried)) if found < best else (best, octaves)
+            if found < best:
+                best, octaves = found, float(tried)
         if step == _STEPS[0] and octaves == 0.0:
             break
     if best < least and abs(octaves) > np.log2(1.0 + _LEAST_CHANGE):

@@ -161,21 +161,21 @@ def _calibration(outcome: Outcome, row: int, names: Names) -> Calibration:
     free = network.lens_sigmas[row] > 0.0
     corner_px = np.array([COLMAP_OFFSET_PX * (name in ("cx", "cy")) for name in LENS])
     values, priors = state.lens[row] + corner_px, stated.lens_prior[row] + corner_px
-    parameters = {
-        name: Parameter(
-            float(values[k]), float(sigmas[k]) if free[k] else 0.0, float(priors[k]), float(stated.lens_sigmas[row, k])
-        )
-        for k, name in enumerate(LENS)
-        if name != "unused" and (name != "readout_s" or free[k])
-    }
-    strong = [] if found is None else [
-        Correlation(first, second, round(value, 3))
-        for camera, first, second, value in lens_correlations(found)
-        if camera == row and abs(value) > _STRONG
-    ]  # fmt: skip
-    change, worth = (np.zeros(len(LENS)), 0.0) if outcome.if_freed is None else (
-        outcome.if_freed[0][row], outcome.if_freed[1]
-    )  # fmt: skip
+    parameters = {}
+    for k, name in enumerate(LENS):
+        if name == "unused" or (name == "readout_s" and not free[k]):
+            continue
+        sigma = float(sigmas[k]) if free[k] else 0.0
+        parameters[name] = Parameter(float(values[k]), sigma, float(priors[k]), float(stated.lens_sigmas[row, k]))
+    strong = []
+    if found is not None:
+        for camera, first, second, value in lens_correlations(found):
+            if camera == row and abs(value) > _STRONG:
+                strong.append(Correlation(first, second, round(value, 3)))
+    change, worth = np.zeros(len(LENS)), 0.0
+    if outcome.if_freed is not None:
+        changes, worth = outcome.if_freed
+        change = changes[row]
     return Calibration(
         images=int((network.camera == row).sum()),
         parameters=parameters,

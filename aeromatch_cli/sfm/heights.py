@@ -49,7 +49,9 @@ def shift_to_control_m(group: GroupResult) -> float | None:
     limits_m = np.maximum(_ALIKE_M, _ALIKE_SIGMAS * stated_m)
     up_m = float(np.median(shifts_m[:, 2]))
     alike = np.abs(shifts_m - [0.0, 0.0, up_m]) <= limits_m
-    return up_m if is_undulation(up_m) and abs(up_m) > limits_m[2] and bool(alike.all()) else None
+    if not is_undulation(up_m) or abs(up_m) <= limits_m[2] or not alike.all():
+        return None
+    return up_m
 
 
 def shift_of_points_m(errors_m: Sequence[Sequence[float]], sigmas_m: Sequence[float]) -> float | None:

@@ -26,7 +26,7 @@ from aeromatch_cli.results.stages import MappedModel
 from aeromatch_cli.sfm.bundle.network import LENS
 from aeromatch_cli.sfm.calibration import Calibration, camera_of, freed, held_by, lens_prior
 from aeromatch_cli.sfm.group_results import Names
-from aeromatch_cli.sfm.grouping import rows_by_number
+from aeromatch_cli.sfm.model_arrays import rows_by_number
 from aeromatch_cli.sfm.process import run_process
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from aeromatch_cli.strategies.exporters.contents import ExportContents

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.sfm.bundle.of_model import image_numbers
 
 # Errors of points behind a camera are as large as a number can be.
@@ -72,3 +72,10 @@ def figures(model: Any) -> dict[str, Any]:
         "track_length": model.compute_mean_track_length(),
         "reprojection_error_px": float(errors_px.mean()) if len(errors_px) else None,
     }
+
+
+def rows_by_number(numbers: IntArray) -> dict[int, IntArray]:
+    """Return, by number, the rows (N,) of an array (M,) that hold it, in order."""
+    order = np.argsort(numbers, kind="stable")
+    values, starts = np.unique(numbers[order], return_index=True)
+    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=True)) if len(values) else {}

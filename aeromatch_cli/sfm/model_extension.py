@@ -45,19 +45,34 @@ def grown(
         if not found:
             done.append(model)
             continue
-        parts = [one for one in left if len(found.keys() & one.rotations.keys()) >= _MOST * len(one.rotations)]
-        left = [one for one in left if one not in parts]
-        elsewhere = {i for one in left for i in one.rotations}
-        taken_in = {i: pose for i, pose in found.items() if i not in elsewhere}
-        own = {camera_ids[i] for i in taken_in} & known.keys()
-        larger = _with(model, taken_in, {k: known[k] for k in sorted(own)})
+        larger, parts = _extended(model, left, found, camera_ids, known)
+        others = [one for one in left if one not in parts]
         sound = sound_part(larger, free, lenses, thresholds_px, given)
         if sound is not None and sound.rotations.keys() > model.rotations.keys():
             done.append(sound)
+            left = others
         else:
             done.append(model)
-            left = sorted([*parts, *left], key=lambda one: -len(one.rotations))
+            left = sorted([*parts, *others], key=lambda one: -len(one.rotations))
     return tuple(sorted(done, key=lambda model: -len(model.rotations)))
+
+
+def _extended(
+    model: Model,
+    others: Sequence[Model],
+    found: Mapping[str, Pose],
+    camera_ids: Mapping[str, str],
+    known: Mapping[str, Camera],
+) -> tuple[Model, list[Model]]:
+    """Return the model with the images found that no other one keeps, and those others that become part of it.
+
+    camera_ids: image_id -> camera_id. known: camera_id -> camera as a model has found it.
+    """
+    parts = [one for one in others if len(found.keys() & one.rotations.keys()) >= _MOST * len(one.rotations)]
+    elsewhere = {i for one in others if one not in parts for i in one.rotations}
+    taken_in = {i: pose for i, pose in found.items() if i not in elsewhere}
+    own = {camera_ids[i] for i in taken_in} & known.keys()
+    return _with(model, taken_in, {k: known[k] for k in sorted(own)}), parts
 
 
 def _resected(

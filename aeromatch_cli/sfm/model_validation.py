@@ -57,14 +57,12 @@ def sound_part(
     inside = [p for p in pairs if {p.image_id0, p.image_id1} <= poses.keys() and len(p.indices) >= MIN_MATCHES]
     shares = [explained_share(p, poses, cameras, limits_px) for p in inside]
     wrong = _contradicted(inside, shares)
-    good = [
-        p
-        for p, share in zip(inside, shares, strict=True)
-        if share >= EXPLAINED_SHARE and not wrong & {p.image_id0, p.image_id1}
-    ]
+    explained = [p for p, share in zip(inside, shares, strict=True) if share >= EXPLAINED_SHARE]
+    good = [p for p in explained if not wrong & {p.image_id0, p.image_id1}]
     edges = [(p.image_id0, p.image_id1) for p in good]
-    rigid = max(rigid_groups(good), key=lambda group: (len(group), min(group)), default=set())
-    sure = rigid | (_confirmed(model, given) - wrong if model.kind == "positions" else set())
+    sure = max(rigid_groups(good), key=lambda group: (len(group), min(group)), default=set())
+    if model.kind == "positions":
+        sure = sure | (_confirmed(model, given) - wrong)
     groups = connected_groups([edge for edge in edges if sure.issuperset(edge)])
     if not groups or len(groups[0]) < FEWEST_IMAGES:
         return None

@@ -17,8 +17,7 @@ from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, Int
 from aeromatch_cli.geometry.cameras import focal_px, world_rays
 from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.geometry.epipolar import ray_depths
-from aeromatch_cli.sfm.connectivity import probable_enough
-from aeromatch_cli.sfm.probability import MatchEvidence, off_neighbours_px, probabilities, usual_off_px
+from aeromatch_cli.sfm.probability import MatchEvidence, off_neighbours_px, probabilities, probable_enough, usual_off_px
 
 # Rays that meet at a smaller angle do not tell whether they meet in front of the cameras.
 _LEAST_ANGLE_DEG = 0.5
@@ -186,22 +185,31 @@ def _masks(
     """Return, for every pair, which matches (M,) contradict the block; None where it is not judged. group: of the
     images that are."""
     held = [p.image_id0 in group and group[p.image_id0] == group.get(p.image_id1) for p in pairs]
-    ends = [view.keypoints_of(pair) if judged else None for pair, judged in zip(pairs, held, strict=True)]
-    ties = _Ties.of(len(view.rays), [both for both in ends if both is not None])
-    return [None if both is None else _judged(view, ties, *both, limits) for both in ends]
+    ends = {n: view.keypoints_of(pair) for n, pair in enumerate(pairs) if held[n]}
+    ties = _Ties.of(len(view.rays), list(ends.values()))
+    masks: list[BoolArray | None] = [None] * len(pairs)
+    for n, both in ends.items():
+        masks[n] = _judged(view, ties, *both, limits)
+    return masks
 
 
 def _worst_held(pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray | None]) -> set[str]:
     """Images too many of whose matches contradict the block, where none of those that they are paired with is worse."""
     wrong, whole = Counter[str](), Counter[str]()
     for pair, mask in zip(pairs, masks, strict=True):
+        if mask is None:
+            continue
         for image_id in (pair.image_id0, pair.image_id1):
-            wrong[image_id] += 0 if mask is None else int(mask.sum())
-            whole[image_id] += 0 if mask is None else len(mask)
+            wrong[image_id] += int(mask.sum())
+            whole[image_id] += len(mask)
     share = {image_id: wrong[image_id] / count for image_id, count in whole.items() if count}
     bad = {image_id for image_id, value in share.items() if value > _MANY}
-    both = [(p.image_id0, p.image_id1) for p in pairs if {p.image_id0, p.image_id1} <= bad]
-    return bad - {min(ends, key=lambda image_id: (share[image_id], image_id)) for ends in both}
+    better = set()
+    for pair in pairs:
+        ends = pair.image_id0, pair.image_id1
+        if bad.issuperset(ends):
+            better.add(min(ends, key=lambda image_id: (share[image_id], image_id)))
+    return bad - better
 
 
 def _groups(block: AdjustedBlock) -> dict[str, int]:

@@ -1,4 +1,6 @@
-"""Images that hang on an oriented block by pairs without common keypoints, placed by those pairs and their positions.
+"""Poses of images that the model lacks: by a pair and the given position, or as their strip predicts them.
+
+An image may hang on the oriented block by pairs without keypoints in common with others.
 
 A pair tells the attitude of the second image and the direction to it, not the distance: mappers put such images
 anywhere along that direction. The given position tells the distance.
@@ -6,12 +8,14 @@ anywhere along that direction. The given position tells the distance.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, Pair, PairGeometry, Pose
+from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, PairGeometry, Pose
+from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.geometry.two_view import Sampling, estimate, undistorted
 from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, PairPoints, explained_share
 
@@ -25,6 +29,10 @@ _NEAREST = 0.5
 _SLACK = 3.0
 # Standard deviation of the attitude, degrees.
 _SIGMA_DEG = 1.0
+# An image between two oriented ones of its strip is as they are; where these differ by more, the flight turned there.
+_TURN_DEG = 30.0
+# An aircraft's attitude changes by so much from one image to the next.
+_LEAST_SIGMA_DEG = 5.0
 
 
 def tied_by_pairs(
@@ -122,3 +130,50 @@ def _along(known: Pose, given: Pose, direction: FloatArray) -> FloatArray | None
     if distance_m < -limit_m or float(np.linalg.norm(ahead - distance_m * direction)) > limit_m:
         return None
     return np.asarray(known.center_m + max(distance_m, _NEAREST * given.sigma_position_m) * direction)
+
+
+def predicted(block: Block, found: Mapping[str, Pose]) -> dict[str, Pose]:
+    """Return poses of images outside `found` that have a position, from the nearest images before and after in their
+    strip.
+
+    A strip is the images of one camera in the order of capture time, or of name where times are missing. The attitude
+    is that between both neighbours, its standard deviation the angle between them; no attitude where the flight turns
+    or there is no neighbour on either side.
+    """
+    poses = {}
+    for strip in _strips(block.images):
+        oriented = [row for row, image in enumerate(strip) if image.image_id in found]
+        for row, image in enumerate(strip):
+            given, behind = block.poses.get(image.image_id), bisect_left(oriented, row)
+            if given is None or image.image_id in found or not 0 < behind < len(oriented):
+                continue
+            rotations = [found[strip[oriented[k]].image_id].world_rotation for k in (behind - 1, behind)]
+            pose = _between(given, *rotations)
+            if pose is not None:
+                poses[image.image_id] = pose
+    return poses
+
+
+def _strips(images: Sequence[Image]) -> list[list[Image]]:
+    """Return the images of every camera in the order of capture time, or of name where times are missing."""
+    strips = []
+    for camera_id in sorted({image.camera_id for image in images}):
+        strip = [image for image in images if image.camera_id == camera_id]
+        timed = all(image.time for image in strip)
+        strip.sort(key=lambda image: ((image.time or "") if timed else "", image.name))
+        strips.append(strip)
+    return strips
+
+
+def _between(given: Pose, before: FloatArray | None, behind: FloatArray | None) -> Pose | None:
+    """Return the given pose with the attitude between those of both neighbours, (3, 3) cam_from_world; None where one
+    is unknown or the flight turns."""
+    from scipy.spatial.transform import Rotation
+
+    if before is None or behind is None:
+        return None
+    apart_deg = angle_between_deg(before, behind)
+    if apart_deg > _TURN_DEG:
+        return None
+    middle = Rotation.from_matrix(np.array([before, behind])).mean().as_matrix()
+    return replace(given, world_rotation=middle, sigma_angle_deg=max(_LEAST_SIGMA_DEG, apart_deg))

@@ -33,11 +33,19 @@ def consistent_images(
     stored pixels): by image_id. Grouped as `explained_images` are.
     """
     known = {i for i, pose in poses.items() if pose.world_rotation is not None}
-    ties = [p for p in pairs if len(p.indices) >= MIN_MATCHES and {p.image_id0, p.image_id1} <= known]
-    judged = {i for p in ties for i in (p.image_id0, p.image_id1)}
-    agree = {(p.image_id0, p.image_id1): _agrees(p, poses, cameras, thresholds_px) for p in ties}
-    good = grouped_images(agree, {(p.image_id0, p.image_id1): len(p.indices) for p in ties})
-    return good | (known - judged) if len(good) >= _MOST * len(judged) else good
+    judged = set[str]()
+    agree: dict[tuple[str, str], bool] = {}
+    matches: dict[tuple[str, str], int] = {}
+    for pair in pairs:
+        ends = pair.image_id0, pair.image_id1
+        if len(pair.indices) >= MIN_MATCHES and known.issuperset(ends):
+            judged.update(ends)
+            agree[ends] = _agrees(pair, poses, cameras, thresholds_px)
+            matches[ends] = len(pair.indices)
+    good = grouped_images(agree, matches)
+    if len(good) >= _MOST * len(judged):
+        return good | (known - judged)
+    return good
 
 
 def _agrees(

@@ -1,5 +1,5 @@
 """This module states how probable it is that a verified match is right, from the adjusted block and the match's
-neighbours.
+neighbours, and which matches are probable enough to stay.
 
 A logistic model of a few properties that every match has. It was fitted on rendered blocks, whose truth is exact;
 `scripts/bench probability` fits it again and draws how far it can be relied on, on blocks that it has not seen.
@@ -7,12 +7,13 @@ A logistic model of a few properties that every match has. It was fitted on rend
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.geometry.components import labels_by_name
 
 # Distances count in multiples of the pair's median distance from epipolar lines, which is at least so many pixels: some
 # images are held less exactly than others.
@@ -29,6 +30,8 @@ _NOWHERE_PX = 16.0
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/bench probability` has found them.
 WEIGHTS = (4.818, 2.247, 1.148, -0.732, -1.268, -3.094)
+# Matches left to a pair without which images fall apart: enough for a relative orientation, few among all others.
+_BRIDGING = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,3 +141,24 @@ def fitted_weights(values: FloatArray, right: BoolArray) -> FloatArray:
 
 def _logistic(values: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + np.exp(-values)))
+
+
+def probable_enough(
+    ends: Sequence[tuple[str, str]], likely: Sequence[FloatArray | None], least: float, min_matches: int
+) -> list[BoolArray | None]:
+    """Return, for every pair, which of its matches (M,) are as probable as asked; None where no probabilities are
+    known.
+
+    Where images that pairs have tied would fall apart by that, the pairs between the parts keep their best 30 matches:
+    a block whose flights lie a few pixels off each other is worth more than flights that nothing connects. ends: image
+    ids. likely: probabilities (M,). min_matches: a pair with fewer ties nothing.
+    """
+    keep = [None if p is None else p >= least for p in likely]
+    tied = [both for both, mask in zip(ends, keep, strict=True) if mask is None or mask.sum() >= min_matches]
+    part = labels_by_name(sorted({image_id for both in ends for image_id in both}), tied)
+    for n, (both, p) in enumerate(zip(ends, likely, strict=True)):
+        if p is not None and len(p) >= min_matches and part[both[0]] != part[both[1]]:
+            best = np.zeros(len(p), dtype=bool)
+            best[np.argsort(-p, kind="stable")[: max(_BRIDGING, min_matches)]] = True
+            keep[n] = best | (p >= least)
+    return keep

@@ -25,10 +25,9 @@ from aeromatch_cli.sfm.epipolar_agreement import (
 )
 from aeromatch_cli.sfm.mapping import Group, Model
 from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES, SLACK
-from aeromatch_cli.sfm.pair_registration import tied_by_pairs
+from aeromatch_cli.sfm.pair_registration import predicted, tied_by_pairs
 from aeromatch_cli.sfm.pose_prior_check import consistent_images
 from aeromatch_cli.sfm.resection import resected
-from aeromatch_cli.sfm.strip_attitudes import predicted
 
 # Given poses stay where they explain the matches of this share of the images: single others are corrected.
 _MOST = 0.6
@@ -192,17 +191,11 @@ def from_models(
     image_id -> attitude as it was given. exchanged: columns with whose exchange the given positions fit the pictures.
     """
     block = evidence.block
-    cameras = dict(block.cameras)
-    found: dict[str, Pose] = {}
-    for model, kept in reversed(arranged(models, before)):  # the largest model's cameras count
-        height_m = float(np.median([c[2] for c in model.centers_m.values()]) - np.median(model.points_m[:, 2]))
-        sigma_m = _SIGMA_POSITION_SHARE * abs(height_m)
-        for image_id, rotation in model.rotations.items():
-            found[image_id] = Pose(model.centers_m[image_id], rotation, sigma_m, _SIGMA_ANGLE_DEG)
-        found |= kept
-        cameras |= model.cameras
-        cameras |= {k: old for k, old in before.cameras.items() if kept and _same_lens(model.cameras.get(k), old)}
-    beside = {i for model in models if model.kind == "level" for i in model.rotations}
+    cameras, found = _of_models(block, models, before)
+    beside = set[str]()
+    for model in models:
+        if model.kind == "level":
+            beside.update(model.rotations)
     own = bool(models) and found.keys() <= beside
     # The mapper's own points are few: it leans on the longest tracks.
     lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
@@ -215,11 +208,7 @@ def from_models(
     # Given positions are in another frame than one of the pictures' own.
     poses = found if own else {**block.poses, **_loose_poses(evidence, found, convention, angles), **found}
     terrains, points = _terrains(evidence, found, [set(model.rotations) for model in models], lenses)
-    north_deg = {
-        i: sigma for model in models for sigma in [_north_sigma_deg(model, block.poses)] for i in model.rotations
-    }
     judged_poses = {i: pose for i, pose in found.items() if i not in beside}
-    wrong = _judged(block.poses, judged_poses, convention, angles, north_deg)
     result = OrientResult(
         poses_from="pictures",
         stays=False,
@@ -231,9 +220,35 @@ def from_models(
         focal_lengths=_focal_lengths(evidence.stated_cameras, cameras),
         outside=_outside(block, found),
         remarks=[*_position_remarks(models, exchanged), *_convention_remarks(convention)],
-        **wrong,
+        **_judged(block.poses, judged_poses, convention, angles, _north_by_image(models, block.poses)),
     )
     return Solution(cameras, poses, terrains, groups, result)
+
+
+def _of_models(block: Block, models: Sequence[Model], before: Before) -> tuple[dict[str, Camera], dict[str, Pose]]:
+    """Return the block's cameras with those of models in their place, and image_id -> pose of the models' images.
+
+    Where a model agrees with what was found before, poses and cameras found before stay.
+    """
+    cameras, found = dict(block.cameras), dict[str, Pose]()
+    for model, kept in reversed(arranged(models, before)):  # the largest model's cameras count
+        height_m = float(np.median([c[2] for c in model.centers_m.values()]) - np.median(model.points_m[:, 2]))
+        sigma_m = _SIGMA_POSITION_SHARE * abs(height_m)
+        for image_id, rotation in model.rotations.items():
+            found[image_id] = Pose(model.centers_m[image_id], rotation, sigma_m, _SIGMA_ANGLE_DEG)
+        found |= kept
+        cameras |= model.cameras
+        if kept:
+            cameras |= {k: old for k, old in before.cameras.items() if _same_lens(model.cameras.get(k), old)}
+    return cameras, found
+
+
+def _north_by_image(models: Sequence[Model], given: Mapping[str, Pose]) -> dict[str, float]:
+    """Return image_id -> standard deviation of north, degrees, in the model that holds the image."""
+    sigmas_deg: dict[str, float] = {}
+    for model in models:
+        sigmas_deg |= dict.fromkeys(model.rotations, _north_sigma_deg(model, given))
+    return sigmas_deg
 
 
 def _loose_poses(
@@ -313,26 +328,24 @@ def _judged(
     as_given: Mapping[str, Angles] | None = None,
     north_deg: Mapping[str, float] | None = None,
 ) -> dict[str, dict[str, float]]:
-    """Given attitudes and positions that those found contradict: image_id -> degrees, image_id -> metres.
+    """Return given attitudes and positions that those found contradict: image_id -> degrees, image_id -> metres.
 
-    north_deg: image_id -> standard deviation of north in the frame of what was found, where it is not exact.
-
-    convention: how the angles as they were given are to be read, where they are wrong as a whole.
+    convention: how the angles as they were given are to be read, where they are wrong as a whole. north_deg: image_id
+    -> standard deviation of north in the frame of what was found, where it is not exact.
     """
-    if convention is not None and as_given is not None:
-        read = {
-            i: replace(given[i], world_rotation=convention.rotation(one)) for i, one in as_given.items() if i in given
-        }
-        given = {**given, **read}
-    angles = {i: round(error, 1) for i, error in attitude_errors_deg(given, found).items()}
-    open_deg = {i: _OPEN_SIGMAS * (north_deg or {}).get(i, 0.0) for i in angles}
-    limits_deg = {i: max(_WRONG_DEG, _WRONG_SIGMAS * given[i].sigma_angle_deg, open_deg[i]) for i in angles}
-    shifts = {i: round(error, 2) for i, error in position_errors_m(given, found).items()}
-    limits = {i: _WRONG_SIGMAS * (given[i].sigma_position_m + found[i].sigma_position_m) for i in shifts}
-    return {
-        "wrong_attitudes": {i: error for i, error in sorted(angles.items()) if error > limits_deg[i]},
-        "wrong_positions": {i: error for i, error in sorted(shifts.items()) if error > limits[i]},
-    }
+    given = dict(given)
+    for i, angles in (as_given or {}).items():
+        if convention is not None and i in given:
+            given[i] = replace(given[i], world_rotation=convention.rotation(angles))
+    attitudes, positions = {}, {}
+    for i, error_deg in sorted(attitude_errors_deg(given, found).items()):
+        open_deg = _OPEN_SIGMAS * (north_deg or {}).get(i, 0.0)
+        if round(error_deg, 1) > max(_WRONG_DEG, _WRONG_SIGMAS * given[i].sigma_angle_deg, open_deg):
+            attitudes[i] = round(error_deg, 1)
+    for i, error_m in sorted(position_errors_m(given, found).items()):
+        if round(error_m, 2) > _WRONG_SIGMAS * (given[i].sigma_position_m + found[i].sigma_position_m):
+            positions[i] = round(error_m, 2)
+    return {"wrong_attitudes": attitudes, "wrong_positions": positions}
 
 
 def _focal_lengths(given: Mapping[str, Camera], found: Mapping[str, Camera]) -> dict[str, FocalChange]:

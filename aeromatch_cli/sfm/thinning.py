@@ -14,8 +14,7 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.sfm.bundle.of_model import image_numbers
-from aeromatch_cli.sfm.grouping import rows_by_number
-from aeromatch_cli.sfm.model_arrays import tracks_of
+from aeromatch_cli.sfm.model_arrays import rows_by_number, tracks_of
 
 # Cells of an image along its sides, and points in each.
 _COLUMNS, _ROWS, _IN_A_CELL = 10, 8, 5

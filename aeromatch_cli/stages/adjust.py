@@ -14,16 +14,14 @@ from aeromatch_cli.data import AdjustedBlock, PoseResidual
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.files import write_atomically, write_text
 from aeromatch_cli.fingerprints import fingerprint
-from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
-from aeromatch_cli.formats.residuals import residuals_text
+from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, residuals_text, write_adjusted
 from aeromatch_cli.geometry.cameras import BROWN, MODELS, focal_px
 from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.results.adjustment import Control, GroupResult
 from aeromatch_cli.results.stages import AdjustResult
-from aeromatch_cli.sfm.block_figures import block_figures
+from aeromatch_cli.sfm.block_figures import block_figures, residual_figures, residuals_of
 from aeromatch_cli.sfm.calibration import held_by
 from aeromatch_cli.sfm.mapping import Group, adjust_block
-from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
 from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context

@@ -13,8 +13,7 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair
 from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
-from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
-from aeromatch_cli.formats.dropped import Dropped, write_dropped
+from aeromatch_cli.formats.adjusted import Dropped, read_adjusted, write_adjusted, write_dropped
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
 from aeromatch_cli.results.stages import ConsistencyResult, FilterResult, Ninths

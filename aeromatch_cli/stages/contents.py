@@ -11,8 +11,8 @@ import numpy as np
 from aeromatch_cli.blocks.crs import LOCAL, geographic_from_grid
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Pair
 from aeromatch_cli.errors import BrokenFileError, InputError, ItemError
-from aeromatch_cli.formats.refined import read_final_keypoints
-from aeromatch_cli.formats.residuals import read_residuals
+from aeromatch_cli.formats.adjusted import read_residuals
+from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
 from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.images.files import read_pixels

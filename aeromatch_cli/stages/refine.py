@@ -19,8 +19,7 @@ import numpy as np
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Pair, PairGeometry
 from aeromatch_cli.files import translated_os_errors, write_atomically
 from aeromatch_cli.fingerprints import fingerprint
-from aeromatch_cli.formats.features import read_keypoints
-from aeromatch_cli.formats.refined import write_refined
+from aeromatch_cli.formats.features import read_keypoints, write_refined
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.results.stages import RefineResult
 from aeromatch_cli.sfm.spanning_trees import Trees, shifts_through, trees_of

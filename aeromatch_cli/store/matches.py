@@ -11,7 +11,7 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, Matches, Verdict
 from aeromatch_cli.errors import WorkspaceError
-from aeromatch_cli.formats.dropped import read_dropped
+from aeromatch_cli.formats.adjusted import read_dropped
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry
 from aeromatch_cli.store.block_store import stale_image
 from aeromatch_cli.store.naming import names_on_file

@@ -8,7 +8,7 @@ from pathlib import Path
 from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.formats.adjusted import read_adjusted
-from aeromatch_cli.formats.refined import read_final_keypoints
+from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_images, read_pairs, read_poses
 from aeromatch_cli.images.remote import is_remote, on_disk, remote_file

@@ -25,7 +25,7 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
 from aeromatch_cli.evaluate.scores import CORRECT_PX
 from aeromatch_cli.formats.adjusted import read_adjusted
-from aeromatch_cli.formats.refined import read_final_keypoints
+from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_images, read_poses
 from aeromatch_cli.lab.opening import open_truth

@@ -36,8 +36,7 @@ from aeromatch_cli.fingerprints import stable_hash
 from aeromatch_cli.lab.opening import open_truth
 from aeromatch_cli.lab.synthetic import Truth, load_truth
 from aeromatch_cli.stages import simulate
-from aeromatch_cli.strategies.matchers.descriptors.search import Search
-from aeromatch_cli.strategies.matchers.descriptors.views import comparable
+from aeromatch_cli.strategies.matchers.descriptors.search import Search, comparable
 from benchmarks import options, stamps
 from benchmarks.peers.base import Options, Scene
 from benchmarks.peers.ours import Preset

@@ -14,6 +14,7 @@ state units and, where the first line is missing, the CRS; names of the columns 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
@@ -35,29 +36,16 @@ def read_gcp_list(source: Source) -> Survey:
     if len(records) < 2:
         raise ConfigError(f"{source.path}: no control points: the first line names the CRS, then {_COLUMNS}")
     said = units_of_comments(source)
-    if is_number(fields_of(records[0][1])[0][0]):
-        if not said.said.crs:
-            raise ConfigError(
-                f"{source.at(records[0][0])}: the first line names the CRS of the coordinates, such as EPSG:32633: "
-                "add it"
-            )
-        records.insert(0, (1, said.said.crs))
-    if _is_header(records[1][1]):
-        del records[1]
-    elif not _starts_with_numbers(records[1][1]):
-        raise ConfigError(
-            f"{source.path} is no file of control points that is known (it begins with {records[0][1][:60]!r}): write "
-            f"the CRS, then {_COLUMNS}; or a table whose first line names label, x, y, z or label, lat, lon, alt"
-        )
+    (head, crs), *records = _with_crs(source, records, said.said.crs)
     factors = 1.0, 1.0, 1.0
     if said.across_m or said.up_m:  # what comments state counts before the unit of the CRS
-        stated = described_crs(source.at(records[0][0]), records[0][1])
+        stated = described_crs(source.at(head), crs)
         across, up = (said.across_m or stated.across_m) / stated.across_m, (said.up_m or stated.up_m) / stated.up_m
         factors = across, across, up
-    exchanged = all(_names_exchanged(record) for _, record in records[1:])
+    exchanged = all(_names_exchanged(record) for _, record in records)
     points: dict[str, SurveyedPoint] = {}
     marks: list[Mark] = []
-    for line, record in records[1:]:
+    for line, record in records:
         point, one = _row(source, line, record, factors, said.accuracy_m or 1.0, exchanged=exchanged)
         known = points.setdefault(point.name, point)
         if any(abs(a - b) > _SAME * max(1.0, abs(a)) for a, b in zip(known.position, point.position, strict=True)):
@@ -71,9 +59,33 @@ def read_gcp_list(source: Source) -> Survey:
     if exchanged:
         remarks.append(f"{source.path.name}: the names of image and point are exchanged: they were put right")
     return Survey(
-        tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]),
+        tuple(points.values()), tuple(marks), crs, source.at(head),
         remarks=(*remarks, *said.remarks(source)), measured_in=source.path, heights=said.said.zero,
     )  # fmt: skip
+
+
+def _with_crs(source: Source, records: Sequence[tuple[int, str]], stated_crs: str | None) -> list[tuple[int, str]]:
+    """Return the lines of a list with their numbers: the CRS first, then those of points, without one of names.
+
+    records: two lines or more. stated_crs: as a comment states it, for a list whose first line does not. Raises
+    ConfigError for other files.
+    """
+    records = list(records)
+    if is_number(fields_of(records[0][1])[0][0]):
+        if not stated_crs:
+            raise ConfigError(
+                f"{source.at(records[0][0])}: the first line names the CRS of the coordinates, such as EPSG:32633: "
+                "add it"
+            )
+        records.insert(0, (1, stated_crs))
+    if _is_header(records[1][1]):
+        del records[1]
+    elif not _starts_with_numbers(records[1][1]):
+        raise ConfigError(
+            f"{source.path} is no file of control points that is known (it begins with {records[0][1][:60]!r}): write "
+            f"the CRS, then {_COLUMNS}; or a table whose first line names label, x, y, z or label, lat, lon, alt"
+        )
+    return records
 
 
 def is_gcp_line(record: str) -> bool:
@@ -124,13 +136,21 @@ def _row(
     named = len(cells) > 6 and not is_check(cells[6])
     name = cells[6] if named else " ".join(cells[:3])
     rest = [cell for cell in cells[7 if named else 6 :] if not is_check(cell)]
-    sigmas = (
-        [float(cell.replace(",", ".")) for cell in rest] if all(map(is_number, rest)) and len(rest) in (2, 3) else []
-    )
-    if not all(0.0 < sigma < float("inf") for sigma in sigmas):
-        sigmas = []
-    across_m, up_m, sigma_px = (*(accuracy_m * one for one in sigmas[:2]), *sigmas[2:], None, None, None)[:3]
+    across_m, up_m, sigma_px = _accuracies(rest, accuracy_m)
     check = any(map(is_check, cells[6:])) or name.upper().startswith(_CHECK_NAME)
     sigmas_m = completed_sigmas_m(z_m=up_m, across_m=across_m)
     point = SurveyedPoint(name, source.at(line), (x, y, z), sigmas_m, check)
     return point, mark(source, line, (name, cells[5], cells[3], cells[4]), sigma_px, comma=comma)
+
+
+def _accuracies(cells: Sequence[str], unit_m: float) -> tuple[float | None, float | None, float | None]:
+    """Return standard deviations across and up in metres, and of the pixel, as far as two or three numbers state them.
+
+    unit_m: metres of one unit of the first two. None where the cells are none, or state what no accuracy can be.
+    """
+    if len(cells) not in (2, 3) or not all(map(is_number, cells)):
+        return None, None, None
+    sigmas = [float(cell.replace(",", ".")) for cell in cells]
+    if not all(0.0 < sigma < float("inf") for sigma in sigmas):
+        return None, None, None
+    return unit_m * sigmas[0], unit_m * sigmas[1], sigmas[2] if len(sigmas) == 3 else None

@@ -77,6 +77,10 @@ _MARKS: Mapping[str, str] = {
 }  # fmt: skip
 
 
+# Line, and cells by column.
+_Record = tuple[int, Mapping[str, str]]
+
+
 def is_coordinates(source: Source) -> bool:
     """Whether a file is a table of points with three coordinates each."""
     if odm.is_gcp_line(next((record for _, record in source.records()), "")):
@@ -115,13 +119,11 @@ def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
     crs, crs_where = _stated_crs(source, said, geographic="latitude" in names)
     crs = crs or _crs_of_column(source, names, records)
     names, remarks = _one_form(source, names, crs)
-    remarks += tuple(
-        f"{source.path.name}: {words}" for words in (*more, *said.remarks, *(() if crs else said.not_whole))
-    )
-    rows = [
-        (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
-        for line, cells, _ in records
-    ]
+    not_applied = [*more, *said.remarks]
+    if not crs:
+        not_applied += said.not_whole
+    remarks += tuple(f"{source.path.name}: {words}" for words in not_applied)
+    rows = _named_records(names, records) if header else _unnamed_records(source, records)
     stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys((*"xyz", "sigma_xy", "sigma_z"), "")
     points = _points(source, rows, _factors(source, header, stated, said, crs or usual_crs, crs_where))
     geographic = "latitude" in names or _in_degrees(points)
@@ -135,6 +137,14 @@ def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
         crs = None  # of coordinates that the file does not have
     zero = zero_of(re.split(r"[\s_,;/.-]+", _cell_of_heights(source, header, names))) or said.zero
     return Survey(tuple(points), (), crs, crs_where, geographic, remarks, heights=zero)
+
+
+def _named_records(names: Sequence[str], records: Sequence[tuple[int, list[str], bool]]) -> list[_Record]:
+    return [(line, dict(zip(names, cells, strict=False))) for line, cells, _ in records]
+
+
+def _unnamed_records(source: Source, records: Sequence[tuple[int, list[str], bool]]) -> list[_Record]:
+    return [(line, _unnamed(source, line, cells)) for line, cells, _ in records]
 
 
 def _statements(
@@ -198,8 +208,12 @@ def read_marks(source: Source) -> Survey:
 
 def _first(source: Source) -> list[str]:
     """Values of the first line, of that below a CRS."""
-    first = next((_cells(record)[0] for line, record in source.records() if line > _line_of_code(source)), [])
-    return [] if _line_of_code(source) and len(first) != _POINT_VALUES else first  # gcp_list.txt
+    code = _line_of_code(source)
+    for line, record in source.records():
+        if line > code:
+            cells, _ = _cells(record)
+            return cells if not code or len(cells) == _POINT_VALUES else []  # others are those of gcp_list.txt
+    return []
 
 
 def _line_of_code(source: Source) -> int:
@@ -286,10 +300,13 @@ def _unnamed(source: Source, line: int, cells: list[str]) -> dict[str, str]:
     """Columns of a line of Pix4D's file, with a type where words stand behind the coordinates."""
     if len(cells) < 4:
         raise ConfigError(f"{source.at(line)}: {len(cells)} values, label and three coordinates are needed")
-    numbers = [cell for cell in cells[4:] if is_number(cell)]
-    words = [cell for cell in cells[4:] if cell and not is_number(cell)]
-    record = dict(zip(("label", "x", "y", "z"), cells, strict=False)) | {"type": words[0] if words else ""}
-    return record | (dict(zip(("sigma_xy", "sigma_z"), numbers, strict=False)) if len(numbers) == 2 else {})
+    label, x, y, z, *others = cells
+    numbers = [cell for cell in others if is_number(cell)]
+    words = [cell for cell in others if cell and not is_number(cell)]
+    record = {"label": label, "x": x, "y": y, "z": z, "type": words[0] if words else ""}
+    if len(numbers) == 2:
+        record["sigma_xy"], record["sigma_z"] = numbers
+    return record
 
 
 def _point(source: Source, line: int, record: Mapping[str, str], factors: Mapping[str, float]) -> SurveyedPoint:

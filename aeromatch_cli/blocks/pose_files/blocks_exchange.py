@@ -35,43 +35,46 @@ def read_blocks_exchange(source: Source) -> PoseList:
     root = source.xml_root()
     systems = {srs.findtext("Id"): srs.findtext("Definition") or "" for srs in root.iter("SRS")}
     rows: list[PoseRow] = []
-    groups: list[str] = []
     found: dict[str, StatedCrs] = {}
     cameras = CameraShelf(source.path.name)
     unposed = 0
-    for block in root.iter("Block"):
-        for group in block.iter("Photogroup"):
-            key = f"group{len(groups)}"
-            groups.append(key)
-            cameras.add(key, _lens(group))
-            identifier = group.findtext("SRSId") or block.findtext("SRSId")
-            definition = systems.get(identifier, "") if identifier else ""
-            system = described_crs(str(source.path), definition) if definition else StatedCrs()
-            axes = _cam_from_axes(source, group.findtext("CameraOrientation") or "XRightYDown")
-            for photo in group.iter("Photo"):
-                path = (photo.findtext("ImagePath") or "").replace("\\", "/")
-                center = photo.find("Pose/Center")
-                if center is None:
-                    unposed += 1
-                    continue
-                found[system.name] = system
-                at = system.position(
-                    f"{source.path}, photo {path}", *(_value(source, path, center, axis) for axis in "xyz")
-                )
-                rotation = _rotation(source, path, photo.find("Pose/Rotation"))
-                cam = None if rotation is None else axes @ rotation
-                rows.append(rotation_row(_short(path), len(rows) + 1, at, cam, system.kind, camera=cameras.key(key)))
+    groups = [(block, group) for block in root.iter("Block") for group in block.iter("Photogroup")]
+    for count, (block, group) in enumerate(groups):
+        key = f"group{count}"
+        cameras.add(key, _lens(group))
+        identifier = group.findtext("SRSId") or block.findtext("SRSId")
+        definition = systems.get(identifier, "") if identifier else ""
+        system = described_crs(str(source.path), definition) if definition else StatedCrs()
+        axes = _cam_from_axes(source, group.findtext("CameraOrientation") or "XRightYDown")
+        for photo in group.iter("Photo"):
+            if photo.find("Pose/Center") is None:
+                unposed += 1
+                continue
+            found[system.name] = system
+            rows.append(_row(source, photo, len(rows) + 1, system, axes, cameras.key(key)))
     if len(found) > 1:
         raise ConfigError(f"{source.path}: photo groups are in different reference systems: export them in one")
     if not rows:
         raise ConfigError(f"{source.path}: no photo of this BlocksExchange file has a pose")
     _, system = found.popitem()
     crs, kind = system.crs, system.kind
-    remarks = [*system.remarks, *([f"{source.path.name}: {unposed} photos have no pose there"] if unposed else [])]
+    remarks = [*system.remarks]
+    if unposed:
+        remarks.append(f"{source.path.name}: {unposed} photos have no pose there")
     words = crs or ("degrees" if kind == "geographic" else "local frame")
     remarks += cameras.remarks
     title = f"BlocksExchange, {words}"
     return PoseList(tuple(rows), kind, tuple(remarks), title, crs, cameras.found, system.heights)
+
+
+def _row(source: Source, photo: Any, number: int, system: StatedCrs, axes: FloatArray, camera: str) -> PoseRow:
+    """Return what a photo with a centre says. axes: (3, 3) camera from the axes of its group; camera: of the group."""
+    path = (photo.findtext("ImagePath") or "").replace("\\", "/")
+    x, y, z = (_value(source, path, photo.find("Pose/Center"), axis) for axis in "xyz")
+    at = system.position(f"{source.path}, photo {path}", x, y, z)
+    rotation = _rotation(source, path, photo.find("Pose/Rotation"))
+    cam = None if rotation is None else axes @ rotation
+    return rotation_row(_short(path), number, at, cam, system.kind, camera=camera)
 
 
 def _lens(group: Any) -> Nearest | None:

@@ -79,33 +79,41 @@ def _records(source: Source) -> Iterator[tuple[int, Mapping[str, Any]]]:
 
 
 def _row(line: int, record: Mapping[str, Any], said: Counter[str]) -> PoseRow:
-    """said: gets what is to be said of an image, counted."""
+    """Return what a record says of an image. said: gets what is to be said of it, counted."""
+    tags = _tags(record)
+    latitude, longitude = _degrees(tags, "GPSLatitude"), _degrees(tags, "GPSLongitude")
+    height = _metres(tags.get("AbsoluteAltitude", tags.get("GPSAltitude")), tags.get("GPSAltitudeRef"))
+    xmp = {f"{space}:{name}": str(v) for name, v in tags.items() for form, space in _NAMESPACES if form.fullmatch(name)}
+    sigmas_m, remark = position_sigmas_m(xmp)
+    if remark:
+        said[remark] += 1
+    elif sigmas_m is None:
+        sigmas_m = completed_sigmas_m(across_m=tag_number(str(tags.get("GPSHPositioningError", "")).removesuffix(" m")))
+    row = PoseRow(
+        image=image_name(str(record[_IMAGE])), line=line, position=None, position_kind="geographic", attitude=None,
+        attitude_kind="none", sigmas_m=sigmas_m, sigma_angle_deg=angle_sigma_deg(xmp), true_north=True,
+    )  # fmt: skip
+    angles = xmp_angles(xmp)
+    if latitude is None or longitude is None:
+        return row
+    row = replace(row, position=(latitude, longitude, height))
+    if angles is None:
+        return row
+    attitude = angles.yaw_deg, angles.pitch_deg, angles.roll_deg
+    forward = angles.convention == "gimbal"
+    return replace(row, attitude=attitude, attitude_kind="yaw_pitch_roll", forward=forward)
+
+
+def _tags(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tags of a record that have a value, without their groups; GPSPosition stands for its two parts."""
     tags: dict[str, Any] = {}
     for name in sorted(record, key=lambda key: key.startswith(f"{_FIRST}:")):
         if record[name] not in ("", "-", None):
             tags[name.rpartition(":")[2]] = record[name]
     both = str(tags.get("GPSPosition", "")).split(",")
     if len(both) == 2:
-        tags = {"GPSLatitude": both[0].strip(), "GPSLongitude": both[1].strip()} | tags
-    latitude, longitude = (_degrees(tags, f"GPS{name}") for name in ("Latitude", "Longitude"))
-    height = _metres(tags.get("AbsoluteAltitude", tags.get("GPSAltitude")), tags.get("GPSAltitudeRef"))
-    xmp = {f"{space}:{name}": str(v) for name, v in tags.items() for form, space in _NAMESPACES if form.fullmatch(name)}
-    angles = xmp_angles(xmp)
-    known = latitude is not None and longitude is not None
-    sigmas_m, remark = position_sigmas_m(xmp)
-    if sigmas_m is None and not remark:
-        sigmas_m = completed_sigmas_m(across_m=tag_number(str(tags.get("GPSHPositioningError", "")).removesuffix(" m")))
-    if remark:
-        said[remark] += 1
-    return PoseRow(
-        image=image_name(str(record[_IMAGE])), line=line,
-        position=(latitude, longitude, height) if latitude is not None and longitude is not None else None,
-        position_kind="geographic",
-        attitude=(angles.yaw_deg, angles.pitch_deg, angles.roll_deg) if angles and known else None,
-        attitude_kind="yaw_pitch_roll" if angles and known else "none",
-        sigmas_m=sigmas_m, sigma_angle_deg=angle_sigma_deg(xmp),
-        forward=angles.convention == "gimbal" if angles and known else None, true_north=True,
-    )  # fmt: skip
+        return {"GPSLatitude": both[0].strip(), "GPSLongitude": both[1].strip()} | tags
+    return tags
 
 
 def _degrees(tags: Mapping[str, Any], name: str) -> float | None:

@@ -18,7 +18,7 @@ from aeromatch_cli.blocks.crs import (
     metric_crs,
     parsed_crs,
 )
-from aeromatch_cli.blocks.poses import PositionKind
+from aeromatch_cli.blocks.pose_columns import PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.ellipsoid import enu_from_geocentric, geocentric

@@ -11,9 +11,10 @@ import io
 from dataclasses import replace
 from typing import Any
 
+from aeromatch_cli.blocks.pose_columns import is_position
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source
-from aeromatch_cli.blocks.poses import PoseList, is_position, read_poses
+from aeromatch_cli.blocks.poses import PoseList, read_poses
 from aeromatch_cli.errors import ConfigError
 
 

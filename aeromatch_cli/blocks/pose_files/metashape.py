@@ -22,9 +22,10 @@ import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.lenses import of_metashape
+from aeromatch_cli.blocks.pose_columns import PositionKind
 from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, geodetic
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.units import factor, named_column
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
@@ -79,19 +80,28 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             rows.append(row)
             used_estimated += from_estimate
     words = ["estimated"] if used_estimated else []
-    words += ["/".join(angles)] if any(row.attitude for row in rows) else ["positions"]
-    remarks = [f"{source.path.name}: {disabled} cameras are not enabled there; they are used"] if disabled else []
+    words.append("/".join(angles) if any(row.attitude for row in rows) else "positions")
+    remarks = []
+    if disabled:
+        remarks.append(f"{source.path.name}: {disabled} cameras are not enabled there; they are used")
     if 0 < used_estimated < len(rows):
         remarks.append(
             f"{source.path.name}: {len(rows) - used_estimated} of {len(rows)} images have no estimated position there; "
             "the given one is used"
         )
     system = system or StatedCrs()
-    code = system.crs if system.crs and len(system.crs) < _LONGEST_CODE else system.name
-    words += [(code if system.crs else "WGS84" if system.kind == "geographic" else "local")] if stated_one else []
+    if stated_one:
+        words.append(_crs_words(system))
     title = f"Metashape reference, {', '.join(words)}"
     warnings = (*system.remarks, *remarks)
     return PoseList(tuple(rows), system.kind, warnings, title, system.crs, heights=system.heights)
+
+
+def _crs_words(system: StatedCrs) -> str:
+    """Return in few words what the coordinates count in."""
+    if not system.crs:
+        return "WGS84" if system.kind == "geographic" else "local"
+    return system.crs if len(system.crs) < _LONGEST_CODE else system.name
 
 
 def _unquoted(line: str) -> str:
@@ -131,7 +141,11 @@ def _factors(where: str, columns: Sequence[str], units: Sequence[str], system: S
         turns = bool(parts & set(_ANGLES[0] + _ANGLES[1])) or (geographic and name[:1] in "xy" and parts <= {"x", "y"})
         if unit and (turns or parts <= {"x", "y", "z", "accuracy"}):
             stem = name.removesuffix("_est")
-            one = system.up_m if stem == "z" else system.across_m if stem in ("x", "y") else 1.0
+            one = 1.0
+            if stem == "z":
+                one = system.up_m
+            elif stem in ("x", "y"):
+                one = system.across_m
             found[name] = factor(where, name, unit, "angle" if turns else "length") / one
             if name.startswith("accuracy_"):
                 found |= {f"accuracy_{part}": found[name] for part in parts}
@@ -164,7 +178,6 @@ def _row(
 
     (x, y, z), from_estimate = triple(("x", "y", "z"))
     attitude, _ = triple(angles)
-    whole = all(math.isfinite(v) for v in attitude)
     x_m, y_m, z_m, across_m, overall_m = (value(name) for name in _ACCURACIES)
     overall_m = overall_m if overall_m > 0.0 else value("accuracy")
     sigmas_m = completed_sigmas_m(x_m, y_m, z_m, across_m=across_m, overall_m=overall_m)
@@ -172,24 +185,42 @@ def _row(
     row = PoseRow(
         image=image_name(record.get("label", "")), line=line,
         position=system.position(source.at(line), x, y, z) if math.isfinite(x + y) else None,
-        position_kind=system.kind,
-        attitude=attitude if whole else None, attitude_kind="none" if not whole else "yaw_pitch_roll",
-        forward=False, true_north=angles[0] == "yaw",
-        sigmas_m=None if from_estimate else sigmas_m,
-        sigma_angle_deg=max(turns, default=None),
+        position_kind=system.kind, attitude=None, attitude_kind="none", forward=False, true_north=angles[0] == "yaw",
+        sigmas_m=None if from_estimate else sigmas_m, sigma_angle_deg=max(turns, default=None),
     )  # fmt: skip
-    if whole and angles == _ANGLES[1]:
-        return replace(row, attitude_kind="omega_phi_kappa", forward=None), from_estimate
-    if whole and angles == _ANGLES[2]:
-        phi, omega, kappa = attitude
-        photo = rotation_y(phi) @ rotation_x(omega) @ rotation_z(kappa)
-        turned = rotation_row(row.image, line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, system.kind)
-        return replace(row, attitude=turned.attitude, attitude_kind="quaternion", forward=None), from_estimate
-    return row, from_estimate
+    if not all(math.isfinite(v) for v in attitude):
+        return row, from_estimate
+    return _with_attitude(row, attitude, angles), from_estimate
+
+
+def _with_attitude(row: PoseRow, attitude: tuple[float, ...], angles: tuple[str, str, str]) -> PoseRow:
+    """Return a row with an attitude of three angles, degrees, by the names of these."""
+    if angles == _ANGLES[0]:
+        return replace(row, attitude=attitude, attitude_kind="yaw_pitch_roll")
+    if angles == _ANGLES[1]:
+        return replace(row, attitude=attitude, attitude_kind="omega_phi_kappa", forward=None)
+    phi, omega, kappa = attitude
+    photo = rotation_y(phi) @ rotation_x(omega) @ rotation_z(kappa)
+    turned = rotation_row(row.image, row.line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, row.position_kind)
+    return replace(row, attitude=turned.attitude, attitude_kind="quaternion", forward=None)
 
 
 def is_cameras_xml(source: Source) -> bool:
     return source.xml is not None and source.xml.tag == "document" and source.xml.find(".//camera") is not None
+
+
+def _in_world(matrix: FloatArray, placed: tuple[FloatArray, FloatArray, float]) -> tuple[FloatArray, FloatArray, bool]:
+    """Return centre (3,) and cam_from_world (3, 3) of a camera, and whether these are degrees and topocentric axes.
+
+    matrix: (4, 4) chunk_from_camera. placed: rotation, shift and scale from the chunk to the world.
+    """
+    turn, shift, scale = placed
+    center = scale * turn @ matrix[:3, 3] + shift
+    rotation = (turn @ matrix[:3, :3]).T
+    if not _EARTH_M[0] < float(np.linalg.norm(center)) < _EARTH_M[1]:
+        return center, rotation, False
+    center = geodetic(center[None])[0]
+    return center, rotation @ enu_from_geocentric(*center[:2]).T, True
 
 
 def read_cameras_xml(source: Source) -> PoseList:
@@ -209,22 +240,12 @@ def read_cameras_xml(source: Source) -> PoseList:
                 unaligned += 1
                 continue
             matrix = _numbers(source, f"camera {label!r}", transform.text, 16).reshape(4, 4)
-            turn, shift, scale = parts.get(camera.get("component_id")) or whole or (np.eye(3), np.zeros(3), 1.0)
-            center = scale * turn @ matrix[:3, 3] + shift
-            world_from_camera = turn @ matrix[:3, :3]
-            earth = _EARTH_M[0] < float(np.linalg.norm(center)) < _EARTH_M[1]
+            placed = parts.get(camera.get("component_id")) or whole or (np.eye(3), np.zeros(3), 1.0)
+            center, rotation, earth = _in_world(matrix, placed)
             georeferenced.add(earth)
-            rotation = world_from_camera.T
-            if earth:
-                center = geodetic(center[None])[0]
-                rotation = rotation @ enu_from_geocentric(*center[:2]).T
-            sensor = f"sensor{camera.get('sensor_id')}"
-            rows.append(
-                rotation_row(
-                    label, len(rows) + 1, center, rotation, "geographic" if earth else "grid", true_north=earth,
-                    camera=cameras.key(sensor),
-                )
-            )  # fmt: skip
+            kind: PositionKind = "geographic" if earth else "grid"
+            lens = cameras.key(f"sensor{camera.get('sensor_id')}")
+            rows.append(rotation_row(label, len(rows) + 1, center, rotation, kind, true_north=earth, camera=lens))
     if len(georeferenced) > 1:
         raise ConfigError(f"{source.path}: some chunks are georeferenced and some are not: export one alone")
     if not rows:
@@ -232,7 +253,7 @@ def read_cameras_xml(source: Source) -> PoseList:
             f"{source.path}: no camera of this Metashape file is aligned: align the photos, or export the reference"
         )
     remarks = [f"{source.path.name}: {unaligned} cameras are not aligned there"] if unaligned else []
-    kind: PositionKind = "geographic" if georeferenced == {True} else "grid"
+    kind = "geographic" if georeferenced == {True} else "grid"
     words = "georeferenced" if kind == "geographic" else "not georeferenced"
     title = f"Metashape cameras.xml, {words}"
     return PoseList(tuple(rows), kind, (*remarks, *cameras.remarks), title, None, cameras.found)

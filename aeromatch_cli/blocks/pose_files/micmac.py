@@ -71,20 +71,16 @@ def _internal(orientation: Source) -> tuple[str, Any]:
 
 
 def _lens(calibration: Any) -> Nearest | None:
-    """None where the calibration is incomplete."""
+    """Return the lens of a calibration; None where it is incomplete."""
     try:
         (focal,), principal = _values(calibration, ".//F", 1), _values(calibration, ".//PP", 2)
         width, height = (int(value) for value in _values(calibration, ".//SzIm", 2))
-        models = [model for place in calibration.iter("CalibDistortion") for model in place]
-        direct = (calibration.findtext(".//KnownConv") or "eConvApero_DistM2C").strip() == "eConvApero_DistM2C"
-        if {model.tag for model in models} - {"ModRad", "ModPhgrStd", "ModNoDist"} or not direct or len(models) > 1:
-            return Nearest(None)
-        model = models[0] if models and models[0].tag != "ModNoDist" else None
-        center = np.array(principal if model is None else _values(model, ".//CDist", 2))
-        radial = [] if model is None else [float(item.text) for item in model.iter("CoeffDist")]
-        p1, p2, b1, b2 = (float(calibration.findtext(f".//{name}") or 0.0) for name in ("P1", "P2", "b1", "b2"))
+        distortion = _distortion(calibration, principal)
     except (TypeError, ValueError, OverflowError):
         return None
+    if distortion is None:
+        return Nearest(None)
+    center, radial, (p1, p2, b1, b2) = distortion
     powers = [term * focal ** (2 * k) for k, term in enumerate(radial, 1)]
     middle = principal[0] + 0.5, principal[1] + 0.5
     if np.allclose(center, principal) and not b1 and not b2:
@@ -107,6 +103,24 @@ def _lens(calibration: Any) -> Nearest | None:
     values = {"fx": focal * (1.0 + b1), "fy": focal, "skew": focal * b2, "cx": principal[0], "cy": principal[1]}
     values |= {"p1": p2 * focal, "p2": p1 * focal} | {f"k{k}": term for k, term in enumerate(powers[:3], 1)}
     return nearest(brown_camera((width, height), values), forward)
+
+
+def _distortion(calibration: Any, principal: list[float]) -> tuple[FloatArray, list[float], tuple[float, ...]] | None:
+    """Return the centre (2,) of the distortion, its radial terms, and p1, p2, b1, b2; None for others.
+
+    principal: the principal point, which is the centre where there is no distortion. Raises ValueError and TypeError
+    where numbers are missing.
+    """
+    models = [model for place in calibration.iter("CalibDistortion") for model in place]
+    direct = (calibration.findtext(".//KnownConv") or "eConvApero_DistM2C").strip() == "eConvApero_DistM2C"
+    if {model.tag for model in models} - {"ModRad", "ModPhgrStd", "ModNoDist"} or not direct or len(models) > 1:
+        return None
+    center, radial = np.array(principal), list[float]()
+    if models and models[0].tag != "ModNoDist":
+        center = np.array(_values(models[0], ".//CDist", 2))
+        radial = [float(item.text) for item in models[0].iter("CoeffDist")]
+    terms = tuple(float(calibration.findtext(f".//{name}") or 0.0) for name in ("P1", "P2", "b1", "b2"))
+    return center, radial, terms
 
 
 def _values(element: Any, place: str, count: int) -> list[float]:

@@ -20,8 +20,15 @@ import numpy as np
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.crs import convergence_deg, utm_crs
 from aeromatch_cli.blocks.fields import fields_of, with_name
-from aeromatch_cli.blocks.pose_files.geodesy import described_crs, like_utm
-from aeromatch_cli.blocks.pose_files.source import Source, coordinate, image_name, rotation_row, units_of_comments
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, like_utm
+from aeromatch_cli.blocks.pose_files.source import (
+    Source,
+    Units,
+    coordinate,
+    image_name,
+    rotation_row,
+    units_of_comments,
+)
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
@@ -45,34 +52,15 @@ def is_geo_txt(source: Source) -> bool:
 
 def read_geo_txt(source: Source) -> PoseList:
     """Raises ConfigError with file, line and column."""
-    records = list(source.records())
-    head, text = records[0]
+    (head, text), *records = source.records()
     stated, said = described_crs(source.at(head), text), units_of_comments(source)
     stated = replace(stated, across_m=said.across_m or stated.across_m, up_m=said.up_m or stated.up_m)
-    turn_deg = said.angle_deg or 1.0
     rows: list[PoseRow] = []
     as_written: list[tuple[float, float]] = []
-    for line, record in records[1:]:
-        cells, comma = fields_of(record)
-        fields = with_name(cells, 0)
-        if len(fields) < 3:
-            raise ConfigError(f"{source.at(line)}: {len(fields)} values: write `name x y [z] [yaw pitch roll] [h v]`")
-        values = [_value(source.at(line, f"{column}"), cell, comma) for column, cell in enumerate(fields[1:9], start=2)]
-        x, y, z = [*values, np.nan, np.nan][:3]
-        angles = [turn_deg * angle for angle in values[3:6]] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
-        one_m = said.accuracy_m or 1.0
-        across_m, up_m = (one_m * one for one in values[6:8]) if len(fields) >= _WITH_ACCURACIES else (None, None)
-        as_written.append((x, y))
-        place = stated.position(source.at(line), x, y, z)
-        whole = bool(np.isfinite(angles).all())
-        rows.append(
-            PoseRow(
-                image=image_name(fields[0]), line=line, position=place if np.isfinite(place[:2]).all() else None,
-                position_kind=stated.kind, attitude=tuple(angles) if whole else None,
-                attitude_kind="yaw_pitch_roll" if whole else "none", forward=False, true_north=True,
-                sigmas_m=completed_sigmas_m(z_m=up_m, across_m=across_m),
-            )
-        )  # fmt: skip
+    for line, record in records:
+        row, place = _geo_row(source, line, record, stated, said)
+        rows.append(row)
+        as_written.append(place)
     given = [row.attitude for row in rows if row.attitude is not None]
     words = "yaw, pitch, roll" if given else "positions"
     remarks = (*stated.remarks, *like_utm(stated, as_written), *said.remarks(source))
@@ -80,6 +68,31 @@ def read_geo_txt(source: Source) -> PoseList:
         remarks += (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
     title = f"ODM geo.txt, {text}, {words}"
     return PoseList(tuple(rows), stated.kind, remarks, title, stated.crs, heights=stated.heights or said.said.zero)
+
+
+def _geo_row(
+    source: Source, line: int, record: str, stated: StatedCrs, said: Units
+) -> tuple[PoseRow, tuple[float, float]]:
+    """Return what a line of geo.txt says, and its first two coordinates as they stand there."""
+    cells, comma = fields_of(record)
+    fields = with_name(cells, 0)
+    if len(fields) < 3:
+        raise ConfigError(f"{source.at(line)}: {len(fields)} values: write `name x y [z] [yaw pitch roll] [h v]`")
+    values = [_value(source.at(line, f"{column}"), cell, comma) for column, cell in enumerate(fields[1:9], start=2)]
+    x, y, z = [*values, np.nan, np.nan][:3]
+    attitude = None
+    if len(fields) >= _WITH_ANGLES and np.isfinite(values[3:6]).all():
+        attitude = tuple((said.angle_deg or 1.0) * angle for angle in values[3:6])
+    across_m = up_m = None
+    if len(fields) >= _WITH_ACCURACIES:
+        across_m, up_m = ((said.accuracy_m or 1.0) * one for one in values[6:8])
+    place = stated.position(source.at(line), x, y, z)
+    row = PoseRow(
+        image=image_name(fields[0]), line=line, position=place if np.isfinite(place[:2]).all() else None,
+        position_kind=stated.kind, attitude=attitude, attitude_kind="none" if attitude is None else "yaw_pitch_roll",
+        forward=False, true_north=True, sigmas_m=completed_sigmas_m(z_m=up_m, across_m=across_m),
+    )  # fmt: skip
+    return row, (x, y)
 
 
 def _value(where: str, cell: str, comma: bool) -> float:

@@ -13,10 +13,11 @@ import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.lenses import of_opensfm
+from aeromatch_cli.blocks.pose_columns import PositionKind
 from aeromatch_cli.blocks.pose_files.geodesy import from_topocentric
 from aeromatch_cli.blocks.pose_files.odm import rotation_of_vector
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, rotation_row
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 

@@ -12,16 +12,18 @@ offset lies beside in *_offset.xyz.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.fields import IMAGE, fields_of
+from aeromatch_cli.blocks.pose_columns import AttitudeKind, PositionKind, has_header
 from aeromatch_cli.blocks.pose_files.source import (
     CameraShelf,
     Source,
+    Units,
     image_name,
     is_number,
     number,
@@ -29,7 +31,7 @@ from aeromatch_cli.blocks.pose_files.source import (
     rotation_row,
     units_of_comments,
 )
-from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind, has_header
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.lenses import Nearest, brown
 
@@ -49,20 +51,8 @@ def is_geolocation(source: Source) -> bool:
 
 def read_geolocation(source: Source, angles: str = "") -> PoseList:
     """angles: "opk" or "ypr", "" to go by the numbers. Raises ConfigError with line and column."""
-    table: list[tuple[int, str, list[float]]] = []
     said = units_of_comments(source)
-    for line, record in source.records():
-        cells, comma = fields_of(record)
-        if len(cells) not in _COUNTS:
-            raise ConfigError(f"{source.at(line)}: {len(cells)} values, a line of Pix4D's geolocation has 4, 6, 7 or 9")
-        values = [
-            number(source.at(line, str(column)), cell, decimal_comma=comma) for column, cell in enumerate(cells[1:], 2)
-        ]
-        across_m, up_m, angle_deg = (one or 1.0 for one in (said.across_m, said.up_m, said.angle_deg))
-        units = [across_m, across_m, up_m, *([angle_deg] * 3 if len(values) >= 6 else [])]
-        units += [said.accuracy_m or 1.0] * (len(values) - len(units))
-        values = [a * b for a, b in zip(values, units[: len(values)], strict=True)]
-        table.append((line, cells[0], values))
+    table = list(_lines(source, said))
     places = np.array([values[:2] for _, _, values in table])
     kind: PositionKind = "geographic" if np.abs(places).max() <= 180.0 else "grid"
     exchanged = kind == "geographic" and bool((np.abs(places[:, 0]) > 90.0).any())
@@ -73,17 +63,35 @@ def read_geolocation(source: Source, angles: str = "") -> PoseList:
     remarks = list(said.remarks(source))
     words = "positions"
     if len(attitudes):
-        words = "omega, phi, kappa" if chosen == "opk" else "yaw, pitch, roll"
-        other = "pix4d-ypr" if chosen == "opk" else "pix4d-opk"
+        words, other = ("omega, phi, kappa", "ypr") if chosen == "opk" else ("yaw, pitch, roll", "opk")
         if not angles:
             remarks.append(
-                f"{source.path.name}: the angles are read as {words}; --pose-format {other} reads them otherwise"
+                f"{source.path.name}: the angles are read as {words}; --pose-format pix4d-{other} reads them otherwise"
             )
     if exchanged:
         remarks.append(f"{source.path.name}: longitude stands before latitude, as numbers beyond 90 show")
     where = "latitude, longitude" if kind == "geographic" else "grid"
     title = f"Pix4D geolocation, {where}, {words}"
     return PoseList(rows, kind, tuple(remarks), title, heights=said.said.zero)
+
+
+def _lines(source: Source, said: Units) -> Iterator[tuple[int, str, list[float]]]:
+    """Yield the number, the image and the values of every line, in metres and degrees."""
+    across_m, up_m, angle_deg, accuracy_m = (
+        one or 1.0 for one in (said.across_m, said.up_m, said.angle_deg, said.accuracy_m)
+    )
+    for line, record in source.records():
+        cells, comma = fields_of(record)
+        if len(cells) not in _COUNTS:
+            raise ConfigError(f"{source.at(line)}: {len(cells)} values, a line of Pix4D's geolocation has 4, 6, 7 or 9")
+        values = [
+            number(source.at(line, str(column)), cell, decimal_comma=comma) for column, cell in enumerate(cells[1:], 2)
+        ]
+        units = [across_m, across_m, up_m]
+        if len(values) >= 6:
+            units += [angle_deg] * 3
+        units += [accuracy_m] * (len(values) - len(units))
+        yield line, cells[0], [a * b for a, b in zip(values, units[: len(values)], strict=True)]
 
 
 def _likely_angles(attitudes: np.ndarray) -> str:

@@ -102,7 +102,10 @@ def read_transforms(source: Source) -> PoseList:
         center = turn[:3, :3] @ (matrix[:, 3] / scale) + turn[:3, 3]
         world_from_photo = turn[:3, :3] @ matrix[:, :3]
         lens = _lens(tree | frame)
-        key = "" if lens is None else "camera" if not {"fl_x", "camera_angle_x"} & frame.keys() else f"camera{count}"
+        key = ""
+        if lens is not None:
+            of_frame = {"fl_x", "camera_angle_x"} & frame.keys()
+            key = f"camera{count}" if of_frame else "camera"
         cameras.add(key, lens)
         short = name.rsplit("images/", 1)[-1]
         rows.append(rotation_row(short, count, center, CAM_FROM_PHOTO @ world_from_photo.T, camera=cameras.key(key)))

@@ -14,7 +14,8 @@ import numpy as np
 
 from aeromatch_cli.blocks.gis_columns import with_coordinates
 from aeromatch_cli.blocks.lenses import remark
-from aeromatch_cli.blocks.poses import PoseRow, PositionKind
+from aeromatch_cli.blocks.pose_columns import PositionKind
+from aeromatch_cli.blocks.poses import PoseRow
 from aeromatch_cli.blocks.statements import Quantity, Statements, statements_of
 from aeromatch_cli.blocks.units import Kind, factor, refuse_rounded
 from aeromatch_cli.data import Camera, FloatArray

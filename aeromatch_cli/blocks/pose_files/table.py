@@ -11,6 +11,7 @@ from pathlib import Path
 from aeromatch_cli.blocks.crs import AUTO as AUTO_CRS
 from aeromatch_cli.blocks.crs import LOCAL
 from aeromatch_cli.blocks.fields import IMAGE, fields_of
+from aeromatch_cli.blocks.pose_columns import has_header, is_track
 from aeromatch_cli.blocks.pose_files import (
     blocks_exchange,
     colmap,
@@ -28,7 +29,7 @@ from aeromatch_cli.blocks.pose_files import (
 )
 from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, like_utm
 from aeromatch_cli.blocks.pose_files.source import Source, is_number, units_of_comments, world_beside
-from aeromatch_cli.blocks.poses import PoseList, has_header, is_track, read_poses
+from aeromatch_cli.blocks.poses import PoseList, read_poses
 from aeromatch_cli.blocks.statements import statements_of
 from aeromatch_cli.errors import ConfigError
 

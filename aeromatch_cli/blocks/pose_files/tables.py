@@ -22,6 +22,7 @@ from pathlib import PureWindowsPath
 import numpy as np
 
 from aeromatch_cli.blocks.fields import fields_of, with_name, words_of
+from aeromatch_cli.blocks.pose_columns import has_header
 from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs
 from aeromatch_cli.blocks.pose_files.source import (
     Source,
@@ -32,7 +33,7 @@ from aeromatch_cli.blocks.pose_files.source import (
     rotation_row,
     units_of_comments,
 )
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, has_header
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.units import factor
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
@@ -52,11 +53,7 @@ def is_plain_table(source: Source) -> bool:
         return False
     records = [record for _, (_, record) in zip(range(3), source.records(), strict=False)]
     tables = [_without_further(with_name(fields_of(record)[0], 0)) for record in records]
-    return bool(tables) and all(
-        (len(cells) == len(_NAMES) and all(map(is_number, cells[1:])) and not is_number(cells[0]))
-        or (len(cells) == len(_NAMES) and all(map(is_number, cells)))
-        for cells in tables
-    )
+    return bool(tables) and all(len(cells) == len(_NAMES) and all(map(is_number, cells[1:])) for cells in tables)
 
 
 def _without_further(cells: list[str]) -> list[str]:
@@ -66,52 +63,58 @@ def _without_further(cells: list[str]) -> list[str]:
 
 def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseList:
     """order: "opk" or "pok". unit: "deg" or "gon". "" for what is usual. Raises ConfigError with line and column."""
-    table, more = [], False
+    table = list(_plain_lines(source))
+    angles = np.array([values[3:] for _, _, values, _ in table])
+    said = units_of_comments(source)
+    gon = unit == "gon" or (not unit and bool(len(angles)) and float(np.abs(angles).max()) > _FULL_DEG)
+    one_deg = _GON_DEG if gon else 1.0
+    if not unit and said.angle_deg is not None:
+        one_deg = said.angle_deg
+    metres = (said.across_m or 1.0, said.across_m or 1.0, said.up_m or 1.0)
+    rows = []
+    for (line, name, values, _), angles_deg in zip(table, angles * one_deg, strict=True):
+        place = [a * b for a, b in zip(values, metres, strict=False)]
+        rows.append(replace(_plain_row(line, name, place, angles_deg, order), numbered=is_number(name)))
+    unit_words = {_GON_DEG: "gon", 1.0: "degrees"}.get(one_deg, "radians")
+    words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {unit_words}"
+    remarks = []
+    if not (order or unit):
+        remarks.append(
+            f"{source.path.name}: no header says what the angles are; they are read as {words}; --pose-format opk, "
+            "opk-gon, pok or pok-gon reads them otherwise"
+        )
+    if any(further for *_, further in table):
+        remarks.append(f"{source.path.name}: what stands behind the angles is not read")
+    title = f"table without header, {words}"
+    return PoseList(tuple(rows), "grid", (*remarks, *said.remarks(source)), title, heights=said.said.zero)
+
+
+def _plain_lines(source: Source) -> Iterator[tuple[int, str, list[float], bool]]:
+    """Yield the number, the image and the values of every line, and whether a number stands behind the angles."""
     for line, record in source.records():
         fields, comma = fields_of(record)
         named = with_name(fields, 0)
         cells = _without_further(named)
-        more |= cells != named
         if len(cells) != len(_NAMES):
             raise ConfigError(f"{source.at(line)}: {len(cells)} values instead of {', '.join(_NAMES)}")
         values = [
             number(source.at(line, name), cell, decimal_comma=comma)
             for name, cell in zip(_NAMES[1:], cells[1:], strict=True)
         ]
-        table.append((line, cells[0], values))
-    angles = np.array([values[3:] for _, _, values in table])
-    said = units_of_comments(source)
-    gon = unit == "gon" or (not unit and bool(len(angles)) and float(np.abs(angles).max()) > _FULL_DEG)
-    one_deg = _GON_DEG if gon else 1.0
-    if not unit and said.angle_deg is not None:
-        one_deg = said.angle_deg
-    angles = angles * one_deg
-    metres = (said.across_m or 1.0, said.across_m or 1.0, said.up_m or 1.0)
-    table = [(line, name, [a * b for a, b in zip(values, metres, strict=False)]) for line, name, values in table]
-    rows = []
-    for (line, name, values), (first, second, kappa) in zip(table, angles, strict=True):
-        numbered = is_number(name)
-        if order == "pok":
-            photo = rotation_y(first) @ rotation_x(second) @ rotation_z(kappa)
-            row = rotation_row(name, line, values, CAM_FROM_PHOTO @ photo.T)
-        else:
-            row = PoseRow(
-                image=image_name(name), line=line, position=(values[0], values[1], values[2]), position_kind="grid",
-                attitude=(float(first), float(second), float(kappa)), attitude_kind="omega_phi_kappa",
-            )  # fmt: skip
-        rows.append(replace(row, numbered=numbered))
-    behind = (f"{source.path.name}: what stands behind the angles is not read",) if more else ()
-    unit_words = {_GON_DEG: "gon", 1.0: "degrees"}.get(one_deg, "radians")
-    words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {unit_words}"
-    remarks: tuple[str, ...] = ()
-    if not (order or unit):
-        remarks = (
-            f"{source.path.name}: no header says what the angles are; they are read as {words}; --pose-format opk, "
-            "opk-gon, pok or pok-gon reads them otherwise",
-        )
-    title = f"table without header, {words}"
-    remarks = (*remarks, *behind, *said.remarks(source))
-    return PoseList(tuple(rows), "grid", remarks, title, heights=said.said.zero)
+        yield line, cells[0], values, cells != named
+
+
+def _plain_row(line: int, name: str, place: Sequence[float], angles_deg: FloatArray, order: str) -> PoseRow:
+    """Return a row of a position (3,) in metres and of angles (3,) in an order: "pok", else omega, phi, kappa."""
+    first, second, kappa = angles_deg
+    if order == "pok":
+        photo = rotation_y(first) @ rotation_x(second) @ rotation_z(kappa)
+        return rotation_row(name, line, place, CAM_FROM_PHOTO @ photo.T)
+    x, y, z = place
+    return PoseRow(
+        image=image_name(name), line=line, position=(x, y, z), position_kind="grid",
+        attitude=(float(first), float(second), float(kappa)), attitude_kind="omega_phi_kappa",
+    )  # fmt: skip
 
 
 read_opk, read_opk_gon = (
@@ -204,6 +207,18 @@ def is_inpho(source: Source) -> bool:
     return "$PHOTO_FILE" in source.text and "$EXT_ORI" in source.text
 
 
+def _exterior_orientation(
+    source: Source, line: int, following: Sequence[tuple[int, str]]
+) -> tuple[Sequence[float], FloatArray]:
+    """Return the centre and the matrix (3, 3) of the lines behind $EXT_ORI, which stands in `line`."""
+    if len(following) < 4:
+        raise ConfigError(f"{source.at(line)}: four lines follow $EXT_ORI: focal length and centre, and a matrix")
+    (first, text), *others = following
+    matrix = [numbers(source.at(number), row.split(), ("value",) * 3) for number, row in others]
+    _, *center = numbers(source.at(first), text.split(), ("focal", "x", "y", "z"))
+    return center, np.array(matrix)
+
+
 def read_inpho(source: Source) -> PoseList:
     """Raises ConfigError with file and line."""
     turns = dict(_mounts(source.lines))
@@ -228,13 +243,8 @@ def read_inpho(source: Source) -> PoseList:
         elif key == "$CAMERA_ID":
             camera = value
         elif key == "$EXT_ORI":
-            if len(lines) < place + 5:
-                raise ConfigError(
-                    f"{source.at(line)}: four lines follow $EXT_ORI: focal length and centre, and a matrix"
-                )
-            following = [(n, numbers(source.at(n), t.split(), ("value",) * 3)) for n, t in lines[place + 2 : place + 5]]
-            center = numbers(source.at(lines[place + 1][0]), lines[place + 1][1].split(), ("focal", "x", "y", "z"))[1:]
-            photo_from_world = rotation_z(-turns.get(camera, 0.0)) @ np.array([values for _, values in following])
+            center, rotation = _exterior_orientation(source, line, lines[place + 1 : place + 5])
+            photo_from_world = rotation_z(-turns.get(camera, 0.0)) @ rotation
             at = system.position(source.at(line), *center)
             rows.append(rotation_row(name, line, at, CAM_FROM_PHOTO @ photo_from_world, system.kind))
         elif key == "$END":

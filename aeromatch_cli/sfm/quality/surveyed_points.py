@@ -10,6 +10,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.results.adjustment import (
     Control,
     ControlInGroup,
+    Xyz,
     xyz,
 )
 from aeromatch_cli.sfm.heights import height_remedy, shift_of_points_m, zeros_words
@@ -21,18 +22,13 @@ _WRONG_CONTROL: Limits = (0.0, 0.3)
 
 
 def control_points(evidence: QualityInput) -> Found:
-    """Control points that contradict the others, and errors at points that took no part."""
+    """Judge control points that contradict the others, and errors at points that took no part."""
     control = evidence.adjust.control
     if control is None or not control.points:
         yield "control points: none are given"
         return
     inside = [group.control for group in evidence.groups if group.control]
-    unlike = sorted({*(n for one in inside for n in (*one.wrong, *one.exchanged)), *control.doubtful})
-    left_out = {n for one in inside if one.kept for n in (*one.wrong, *one.exchanged)}
-    count = max(control.control + control.check + len(left_out), 1)
-    words = f"{len(unlike)} of {count} surveyed points contradict the others"
-    remedy = f"{', '.join(unlike[:5])}; check their names, coordinates and where they were measured"
-    yield finding_of("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
+    yield _contradicting(control, inside)
     if control.sigmas_m is None:
         yield "control points: too few to check the block by them"
         return
@@ -42,10 +38,7 @@ def control_points(evidence: QualityInput) -> Found:
     for one in inside:
         if not one.kept:
             yield _refused(one, stated_m)
-    # Points left out of few leave a block that is not the one that all of them hold.
-    held_out = [one for one in inside if one.kept and (one.held_out == "check points" or len(one.used) > 3)]
-    found = [one.held_out_rms_m for one in held_out] + [control.check_rmse_m]
-    errors = [error_m for error_m in found if error_m]
+    errors = _independent_errors_m(control, inside)
     as_it_is = list(control.residuals.values()) if _is_as_it_is(control, inside) else []
     up_m = shift_of_points_m(as_it_is, control.sigmas_m)
     if up_m is not None:
@@ -66,6 +59,32 @@ def control_points(evidence: QualityInput) -> Found:
     )
     remedy = "check their coordinates and measurements; more control points at the border of the block help"
     yield finding_of("check points", sigmas, _CONTROL_SIGMAS, words, remedy)
+
+
+def _contradicting(control: Control, adjusted: Sequence[ControlInGroup]) -> Finding:
+    """Judge how many of the surveyed points contradict the others. adjusted: what the adjustment found of them."""
+    unlike, left_out = set(control.doubtful), set[str]()
+    for one in adjusted:
+        unlike.update(one.wrong, one.exchanged)
+        if one.kept:
+            left_out.update(one.wrong, one.exchanged)
+    count = max(control.control + control.check + len(left_out), 1)
+    words = f"{len(unlike)} of {count} surveyed points contradict the others"
+    remedy = f"{', '.join(sorted(unlike)[:5])}; check their names, coordinates and where they were measured"
+    return finding_of("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
+
+
+def _independent_errors_m(control: Control, adjusted: Sequence[ControlInGroup]) -> list[Xyz]:
+    """Return the errors of points that took no part, by axis: in every group, and under a similarity."""
+    errors = []
+    for one in adjusted:
+        # Points left out of few leave a block that is not the one that all of them hold.
+        telling = one.held_out == "check points" or len(one.used) > 3
+        if one.kept and telling and one.held_out_rms_m:
+            errors.append(one.held_out_rms_m)
+    if control.check_rmse_m:
+        errors.append(control.check_rmse_m)
+    return errors
 
 
 def _is_as_it_is(control: Control, adjusted: Sequence[ControlInGroup]) -> bool:

@@ -1,4 +1,7 @@
-"""Gains applied to the full picture, strip by strip: feathered, noise calmed, highlights kept, coloured as if lit."""
+"""Gains applied to the full picture, strip by strip: feathered, noise calmed, highlights kept, coloured as if lit.
+
+Skylight is bluer than the sun's, and the hue of what is nearly black is noise.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.strategies.enhancers.brightness import multiplied
-from aeromatch_cli.strategies.enhancers.colour import as_sunlit
+from aeromatch_cli.strategies.enhancers.brightness import brightness, multiplied
 from aeromatch_cli.strategies.enhancers.shadow_mask import SoftMask, guide_of
 from aeromatch_cli.strategies.enhancers.tone import Tone
 
@@ -17,6 +19,12 @@ _STRIP_PX = 2**20  # pixels worked on at a time: bounds the memory whatever the 
 _LEAST_LOG_GAIN = 0.02  # a smaller gain is less than rounding
 _NOISE_ROWS = 64
 _DETAIL_POWER, _DETAIL_REACH_PX = 0.61, 3
+# Level of the brightest band, as stored, from which the hue of a shadow is believed.
+_KNOWN_LEVEL = 0.16
+# Stored values follow light by about this power (sRGB as a whole).
+_POWER = 2.2
+# Largest change of a band against green: a pair of materials may be taken for one.
+_LARGEST_LOG = 0.7
 
 
 def relit(
@@ -109,3 +117,23 @@ def _enlarged(small: FloatArray, top: int, bottom: int, height: int, width: int)
     return np.asarray(
         cv2.warpAffine(small, matrix, (width, bottom - top), flags=flags, borderMode=cv2.BORDER_REPLICATE)
     )
+
+
+def as_sunlit(
+    lifted: NDArray[Any], level: FloatArray, share: FloatArray, tint: FloatArray, *, linear: bool
+) -> NDArray[Any]:
+    """Lifted pixels (H, W, 3) in the colour that the sun would give them, their gray level unchanged up to rounding.
+
+    level: (H, W) of the brightest band before, 0-1. share: (H, W) of shadow, 0-1; pixels without
+    any stay as they are. tint: (2,) logarithms of by how much red over green, and blue over green, of light are larger
+    where it is lit.
+    """
+    power = 1.0 if linear else _POWER
+    change = np.clip(np.array([tint[0], 0.0, tint[1]]), -_LARGEST_LOG, _LARGEST_LOG) / power
+    before = brightness(lifted).astype(np.float32)
+    bands = lifted.astype(np.float32) * np.exp(share[..., None] * change.astype(np.float32))
+    bands *= (before / np.maximum(brightness(bands), np.float32(1.0)))[..., None]
+    doubt = share * (1.0 - np.clip(level / np.float32(_KNOWN_LEVEL), 0.0, 1.0))
+    bands += doubt[..., None] * (before[..., None] - bands)
+    coloured = np.clip(np.rint(bands), 0, np.iinfo(lifted.dtype).max).astype(lifted.dtype)
+    return np.where((share > 0)[..., None], coloured, lifted)

@@ -68,7 +68,12 @@ class GeoPackage(Strategy):
                 {"image0": [names[a] for (a, _), _ in links.lines], "image1": [names[b] for (_, b), _ in links.lines],
                  "matches": [count for _, count in links.lines]},
             )  # fmt: skip
-            write_styles(path, ("cameras", *(("footprints",) if areas else ()), *(("pairs",) if links.lines else ())))
+            layers = ["cameras"]
+            if areas:
+                layers.append("footprints")
+            if links.lines:
+                layers.append("pairs")
+            write_styles(path, layers)
             count = sum(len(contents.keypoints_px(image.image_id)) for image in solution.images)
             return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
 

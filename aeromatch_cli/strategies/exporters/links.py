@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray
-from aeromatch_cli.formats.adjusted import orientation_fields
-from aeromatch_cli.formats.residuals import fields_of
+from aeromatch_cli.formats.adjusted import orientation_fields, residual_fields
 from aeromatch_cli.geometry.footprints import Footprint, block_footprints
 from aeromatch_cli.geometry.rotations import to_yaw_pitch_roll
 from aeromatch_cli.strategies.exporters.contents import ExportContents
@@ -63,7 +62,7 @@ def camera_fields(contents: ExportContents, solution: Solution, links: Links) ->
             "weak": links.ties[image_id] < WEAK_MATCHES,
         }  # fmt: skip
         if contents.residuals:
-            fields |= fields_of(contents.residuals.get(image_id))
+            fields |= residual_fields(contents.residuals.get(image_id))
         found.append((image_id, fields))
     return found
 

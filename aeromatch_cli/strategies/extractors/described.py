@@ -14,9 +14,8 @@ from pydantic import Field
 from aeromatch_cli.data import Camera, Features, FloatArray, IntArray
 from aeromatch_cli.strategies import Strategy, ViewPixels
 from aeromatch_cli.strategies.extractors.detection import Raw, concatenate, in_source
-from aeromatch_cli.strategies.extractors.merging import merge_keypoints
 from aeromatch_cli.strategies.extractors.reduction import factor_for, in_reduced_views, in_whole_views, reduced
-from aeromatch_cli.strategies.extractors.selection import distinct, even_selection
+from aeromatch_cli.strategies.extractors.selection import distinct, even_selection, merge_keypoints
 
 # Answers this close, at sizes within a factor of two, are one blob.
 _SAME_BLOB_PX = 2.0
@@ -151,8 +150,9 @@ class Described(Strategy):
         """Indices of the views that share a budget: those of the picture as taken, and of the enhanced one, if any."""
         if self.budget == "view":
             return [[index] for index in range(len(views))]
-        groups = [[i for i, item in enumerate(views) if item.view.enhanced is enhanced] for enhanced in (False, True)]
-        return [group for group in groups if group]
+        taken = [i for i, item in enumerate(views) if not item.view.enhanced]
+        enhanced = [i for i, item in enumerate(views) if item.view.enhanced]
+        return [group for group in (taken, enhanced) if group]
 
     def _wanted(self, camera: Camera, views: Sequence[ViewPixels], group: Sequence[int]) -> int:
         """The budget of a group of views: distant ground has its own, as large as the others' for each pixel."""
@@ -172,8 +172,9 @@ class Described(Strategy):
 
 def _near_and_far(views: Sequence[ViewPixels], group: Sequence[int]) -> list[list[int]]:
     """A group of views in two, that of distant ground first."""
-    parts = [[i for i in group if (views[i].view.beyond is None) is near] for near in (False, True)]
-    return [part for part in parts if part]
+    far = [i for i in group if views[i].view.beyond is not None]
+    near = [i for i in group if views[i].view.beyond is None]
+    return [part for part in (far, near) if part]
 
 
 def _features(

@@ -1,4 +1,5 @@
-"""Which features of an image to keep: an exact budget, spread evenly over the ground, strongest first in each place.
+"""Which features of an image to keep: an exact budget, spread evenly over the ground, strongest first in each place;
+and which of them describe the same point, and so become one keypoint with several descriptors.
 
 Cells are anchored in the world where a view knows it, so that two images that see the same ground rank the same points
 against each other, wherever their borders run.
@@ -19,6 +20,9 @@ from aeromatch_cli.strategies import ViewPixels
 _AREA_SAMPLES = 40_000
 # Of a cell that no sample hit, in samples.
 _LEAST_SHOWN = 0.05
+# Two views of one image see a point at the same place and size, up to the detector's own scatter.
+_MERGE_DISTANCE_PX = 1.0
+_MERGE_SIZE_RATIO = 1.5
 
 
 def distinct(points_px: FloatArray, sizes_px: FloatArray, strengths: FloatArray, radius_px: float) -> BoolArray:
@@ -103,3 +107,45 @@ def _turns(cells: IntArray, strengths: FloatArray, seen_cells: IntArray, shown: 
     inside = own[place] == seen_cells
     sums = np.bincount(place[inside], shown[inside], len(own))
     return (rank + 0.5) / np.maximum(sums, _LEAST_SHOWN)[of_feature]
+
+
+def merge_keypoints(
+    points_px: FloatArray, sizes_px: FloatArray, view_idx: IntArray, factor: int = 1
+) -> tuple[IntArray, IntArray]:
+    """Keypoint number of each feature (N,) and the feature that stands for each keypoint (K,), both int64.
+
+    points_px (N, 2), sizes_px (N,) in the source frame, views ascending. Neighbours in the list of equal view, place
+    and size are one keypoint (several orientations). A keypoint of a later view joins the nearest one of the views
+    before it, if each is the other's nearest, within 1 px and a size ratio of 1.5; the earliest view's place stands.
+    factor: by which the views were reduced, and so the pixels that the detector scatters by are larger.
+    """
+    if len(points_px) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    rows = np.column_stack([view_idx, points_px, sizes_px])
+    starts = np.concatenate([[True], (rows[1:] != rows[:-1]).any(axis=1)])
+    first, keypoint_idx = np.flatnonzero(starts), np.cumsum(starts) - 1
+    target = np.arange(len(first))
+    views = view_idx[first]
+    for view in np.unique(views)[1:]:
+        old, new = np.flatnonzero((views < view) & (target == np.arange(len(first)))), np.flatnonzero(views == view)
+        hit_new, hit_old = _same_points(points_px[first] / factor, sizes_px[first], new, old)
+        target[hit_new] = hit_old
+    standing = np.flatnonzero(target == np.arange(len(first)))
+    number = np.empty(len(first), np.int64)
+    number[standing] = np.arange(len(standing))
+    return number[target][keypoint_idx], first[standing]
+
+
+def _same_points(
+    points_px: FloatArray, sizes_px: FloatArray, new: IntArray, old: IntArray
+) -> tuple[IntArray, IntArray]:
+    from scipy.spatial import cKDTree
+
+    if len(new) == 0 or len(old) == 0:
+        return new[:0], old[:0]
+    distance, forward = (np.asarray(x) for x in cKDTree(points_px[old]).query(points_px[new]))
+    backward = np.asarray(cKDTree(points_px[new]).query(points_px[old])[1])
+    ratio = sizes_px[new] / sizes_px[old[forward]]
+    same = (distance <= _MERGE_DISTANCE_PX) & (backward[forward] == np.arange(len(new)))
+    same &= (ratio <= _MERGE_SIZE_RATIO) & (ratio >= 1.0 / _MERGE_SIZE_RATIO)
+    return new[same], old[forward[same]]

@@ -88,13 +88,7 @@ class NeighbourViews(PlaneViews):
         views = [
             self.plane_view(ground, served, down, "ground") or self.plane_view(ground, ground.polygon_m, down, "ground")
         ]
-        for level, azimuth in self._ranked(shared):
-            polygon = np.concatenate([item.polygon_m for item in shared if item.sample == (level, azimuth)])
-            azimuth_rad = float(tilt_azimuths_rad(level)[azimuth])
-            direction = direction_of(level, azimuth_rad)
-            tilt_deg = np.rad2deg(np.arccos(-direction[2]))
-            name = f"tilt{tilt_deg:.0f}-azimuth{np.rad2deg(azimuth_rad):.0f}"
-            views.append(self.plane_view(ground, polygon, direction, name))
+        views += [self._tilted(ground, shared, sample) for sample in self._ranked(shared)]
         made = tuple(view for view in views if view is not None)
         if not made:
             return (source,)
@@ -116,6 +110,16 @@ class NeighbourViews(PlaneViews):
         sample = nearest_sample(stretch, azimuth_rad) if stretch >= self.min_stretch else (0, 0)
         polygon = intersection(ground.polygon_m, theirs.polygon_m, self.margin * ground.flying_height_m)
         return _Wanted(polygon, polygon_area_m2(overlap), sample)
+
+    def _tilted(self, ground: GroundPlane, shared: Sequence[_Wanted], sample: tuple[int, int]) -> View | None:
+        """Return the view along the direction of a sample of the ground that it serves; None where it shows none."""
+        level, azimuth = sample
+        polygon = np.concatenate([item.polygon_m for item in shared if item.sample == sample])
+        azimuth_rad = float(tilt_azimuths_rad(level)[azimuth])
+        direction = direction_of(level, azimuth_rad)
+        tilt_deg = np.rad2deg(np.arccos(-direction[2]))
+        name = f"tilt{tilt_deg:.0f}-azimuth{np.rad2deg(azimuth_rad):.0f}"
+        return self.plane_view(ground, polygon, direction, name)
 
     def _ranked(self, wanted: Sequence[_Wanted]) -> list[tuple[int, int]]:
         """Samples besides the ground view's, those that serve most overlap first, as many as there may be."""

@@ -10,12 +10,11 @@ from aeromatch_cli.data import AdjustedBlock, Camera
 from aeromatch_cli.geometry.components import connected_groups
 from aeromatch_cli.results.adjustment import GroupResult
 from aeromatch_cli.results.stages import AdjustResult
-from aeromatch_cli.sfm.block_figures import block_figures
+from aeromatch_cli.sfm.block_figures import block_figures, residual_figures, residuals_of
 from aeromatch_cli.sfm.control import control_figures
 from aeromatch_cli.sfm.mapping import Observed
 from aeromatch_cli.sfm.outlier_rejection import Contradictions, Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.sfm.quality.finding import QualityInput
-from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 

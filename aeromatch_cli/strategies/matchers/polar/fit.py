@@ -20,11 +20,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.geometry.frames import apply_homography
-from aeromatch_cli.geometry.polar import polar_grid
 from aeromatch_cli.strategies.matchers.polar.level import Level, bilinear_at
 
+_INNERMOST = 6  # samples of the innermost ring
 _TUKEY = 4.0  # residuals beyond so many standard deviations weigh nothing
 _CONVERGED_PX = 2e-3  # at the edge of the grid, level px
 _STILL_PX = 0.5  # weights that change with every step keep relief moving a little
@@ -39,6 +39,55 @@ _LIGHT = 7
 # says nothing of them, they stay at 0.
 _TILT_SIGMA = 0.1
 _NEIGHBOURS = 10.0  # samples that say the same, because their errors are alike
+
+
+@dataclass(frozen=True, eq=False)
+class PolarGrid:
+    """The dynamic polar grid: samples ring by ring from the inside, in proportion to the radius, each ring from +x
+    towards +y.
+
+    A turn of the picture about the grid's centre is a shift along the rings, a change of scale one across them. A plain
+    polar grid has equally many samples on every ring: they crowd inside and starve outside. For rings 1 px apart out to
+    100 px, distance of samples along a ring and area that each stands for:
+
+        ring at                           10 px             50 px             100 px
+        plain, 628 samples a ring         0.10 px 0.10 px2  0.50 px 0.50 px2  1.00 px 1.00 px2    62,800 samples
+        dynamic, 2 pi r samples a ring    1.00 px 1.00 px2  1.00 px 1.00 px2  1.00 px 1.00 px2    31,416 samples
+
+    so the plain grid needs twice the samples and weighs the ground by one over its distance from the centre, where a
+    turn moves it least.
+
+    step_px: between rings, and along each of them. counts: (R,) samples of every ring. ring_idx: (S,) of every sample.
+    offsets_px: (S, 2) from the centre.
+    """
+
+    step_px: float
+    counts: IntArray
+    ring_idx: IntArray
+    offsets_px: FloatArray
+
+    @property
+    def radii_px(self) -> FloatArray:
+        """Radii (R,) of the rings."""
+        return (np.arange(len(self.counts)) + 0.5) * self.step_px
+
+
+def polar_grid(radius_px: float, step_px: float = 1.0) -> PolarGrid:
+    """Rings to the radius, whose samples stand for step_px squared each. Raises ValueError for less than one ring."""
+    rings = int(radius_px / step_px)
+    if rings < 1:
+        raise ValueError(f"a radius of {radius_px} px holds no ring {step_px} px wide")
+    radii = np.arange(rings) + 0.5
+    counts = np.maximum(np.rint(2.0 * np.pi * radii), _INNERMOST).astype(np.int64)
+    ring_idx = np.repeat(np.arange(rings), counts)
+    angles = 2.0 * np.pi * (np.arange(len(ring_idx)) - _first(counts)[ring_idx]) / counts[ring_idx]
+    radii_px = radii[ring_idx] * step_px
+    offsets = np.stack([radii_px * np.cos(angles), radii_px * np.sin(angles)], axis=1)
+    return PolarGrid(float(step_px), counts, ring_idx, offsets)
+
+
+def _first(counts: IntArray) -> IntArray:
+    return np.cumsum(counts) - counts
 
 
 @dataclass(frozen=True, eq=False)
