@@ -40,7 +40,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "features": ("features/*",),
     "matches": ("matches/*",),
     "verified": ("verified/*",),
-    "steps": ("steps/*", "steps.csv"),
+    "steps": ("steps.csv",),
     "refined": ("refined/*",),
     "adjusted": (
         "orientation/adjusted.npz", "orientation/orientation.csv", "orientation/residuals.csv",
@@ -68,7 +68,7 @@ class Stage:
     in_run: bool = True
 
 
-_MATCHED = ("tables", "orientation", "features", "verified", "steps")
+_MATCHED = ("tables", "orientation", "features", "verified")
 
 STAGES: tuple[Stage, ...] = (
     Stage("orient", "block", OrientResult, (), ("orientation",), ("block", "orient")),
@@ -76,11 +76,11 @@ STAGES: tuple[Stage, ...] = (
     Stage("enhance", "image", EnhanceResult, ("tables", "orientation"), ("enhanced",), in_run=False),
     Stage("simulate", "image", ViewsResult, ("tables", "orientation"), ("enhanced", "views"), in_run=False),
     Stage(
-        "extract", "image", ExtractResult, ("tables", "orientation"), ("enhanced", "views", "features", "steps"),
+        "extract", "image", ExtractResult, ("tables", "orientation"), ("enhanced", "views", "features"),
         ("enhance", "simulate", "extract"),
     ),
     Stage(
-        "match", "pair", MatchResult, ("tables", "orientation", "features"), ("matches", "steps"),
+        "match", "pair", MatchResult, ("tables", "orientation", "features"), ("matches", "verified", "steps"),
         ("match", "cascade"),
     ),
     Stage("filter", "pair", FilterResult, (*_MATCHED, "matches"), ("verified",), ("seed", "filter")),
@@ -96,7 +96,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         "report", "block", ReportResult,
-        (*_MATCHED, "matches", "enhanced", "views", "refined", "adjusted", "final", "evaluation"), ("report",),
+        (*_MATCHED, "matches", "steps", "enhanced", "views", "refined", "adjusted", "final", "evaluation"), ("report",),
     ),
 )  # fmt: skip
 

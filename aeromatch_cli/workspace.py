@@ -10,7 +10,7 @@ import contextlib
 import os
 import socket
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aeromatch_cli.errors import InputError, WorkspaceError
@@ -31,11 +31,13 @@ FORMAT_VERSION = 1
 class Workspace:
     """Every path and file name below one root folder. Holds no state.
 
-    features_of: the workspace whose features this one uses, None for its own.
+    step: the step of a cascade whose matches, verdicts and reports are meant, "" for those of the block. features_of:
+    the step whose pictures, views and features these are, "" for those of the block.
     """
 
     root: Path
-    features_of: Workspace | None = None
+    step: str = ""
+    features_of: str = ""
 
     @property
     def lock(self) -> Path:
@@ -86,11 +88,6 @@ class Workspace:
         return self.root / "lost.csv"
 
     @property
-    def finished(self) -> Path:
-        """What a run that ended without a failure has left, to know whether anything has changed since."""
-        return self.root / "finished.json"
-
-    @property
     def orientation(self) -> Path:
         return self.root / "orientation"
 
@@ -127,10 +124,10 @@ class Workspace:
         """The first pass is a small workspace of its own."""
         return Workspace(self.orientation / "first_pass")
 
-    def step(self, name: str, features_of: str) -> Workspace:
-        """A step of a cascade is a workspace of its own. features_of: the step whose features it uses."""
-        root = self.root / "steps"
-        return Workspace(root / name, None if features_of == name else Workspace(root / features_of))
+    def of_step(self, name: str, features_of: str) -> Workspace:
+        """Return the paths of what a step of a cascade makes, in folders of its name. features_of: the step whose
+        features it uses."""
+        return replace(self, step=name, features_of=features_of)
 
     @property
     def steps(self) -> Path:
@@ -138,7 +135,7 @@ class Workspace:
 
     @property
     def reports(self) -> Path:
-        return self.root / "reports"
+        return self.root / "reports" / self.step
 
     @property
     def evaluation(self) -> Path:
@@ -149,31 +146,26 @@ class Workspace:
         return self.root / "report" / "index.html"
 
     def enhanced(self, image_id: str, suffix: str) -> Path:
-        return self._pictures / "enhanced" / f"{image_id}{suffix}"
+        return self.root / "enhanced" / self.features_of / f"{image_id}{suffix}"
 
     def views(self, image_id: str) -> Path:
-        return self._pictures / "simulated" / image_id / "views.json"
+        return self.root / "simulated" / self.features_of / image_id / "views.json"
 
     def view_pictures(self, image_id: str) -> Path:
         """Which pictures of views are kept, and of what."""
-        return self._pictures / "simulated" / image_id / "pictures.json"
+        return self.root / "simulated" / self.features_of / image_id / "pictures.json"
 
     def view(self, image_id: str, view_name: str) -> Path:
-        return self._pictures / "simulated" / image_id / f"{view_name}.png"
+        return self.root / "simulated" / self.features_of / image_id / f"{view_name}.png"
 
     def features(self, image_id: str) -> Path:
-        return self._pictures / "features" / f"{image_id}.npz"
-
-    @property
-    def _pictures(self) -> Path:
-        """Where features lie, and the records of the views that they were found in."""
-        return (self.features_of or self).root
+        return self.root / "features" / self.features_of / f"{image_id}.npz"
 
     def matches(self, image_id0: str) -> Path:
-        return self.root / "matches" / f"{image_id0}.npz"
+        return self.root / "matches" / self.step / f"{image_id0}.npz"
 
     def verified(self, image_id0: str) -> Path:
-        return self.root / "verified" / f"{image_id0}.npz"
+        return self.root / "verified" / self.step / f"{image_id0}.npz"
 
     def refined(self, image_id: str) -> Path:
         """Where its keypoints were measured anew."""
@@ -257,8 +249,8 @@ def _links_below(folder: Path) -> Iterator[Path]:
                 yield from _links_below(Path(entry.path))
 
 
-def opened_workspace(root: Path) -> Workspace:
-    """One that a command wrote, to look at.
+def opened_workspace(root: Path, *, tables: bool = True) -> Workspace:
+    """One that a command wrote, to look at. tables: whether those of the block are compared with their checksums.
 
     Raises InputError where the folder is none, WorkspaceError where it has another format version or a table of the
     block is not as it was written.
@@ -270,7 +262,8 @@ def opened_workspace(root: Path) -> Workspace:
             state = "holds no results yet (images.csv is missing): its run is estimating the orientation, or was ended"
             raise InputError(f"{root} {state} while it did; `aeromatch run` goes on with it")
         raise InputError(f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace")
-    workspace.check_tables()
+    if tables:
+        workspace.check_tables()
     return workspace
 
 

@@ -260,8 +260,8 @@ def _copied(rendered: Path, folder: Path, settings: tuple[str, ...] = ()) -> Sit
 
 # --- comparing workspaces -----------------------------------------------------------------------------------------
 
-# The page tells the time at which it was made, the index and finished.json those of all files.
-_NOT_COMPARED = ("report/index.html", "reports/report.json", "finished.json", "index.sqlite")
+# The page tells the time at which it was made, the index those of all files.
+_NOT_COMPARED = ("report/index.html", "reports/report.json", "index.sqlite")
 
 
 def contents(work: Path) -> dict[str, Any]:
@@ -278,7 +278,7 @@ def _content(path: Path, work: Path) -> Any:
     if path.suffix == ".db":
         return _tables(path)
     text = path.read_bytes().replace(str(work).encode(), b"WORK")
-    if path.parent.name == "reports":
+    if "reports" in path.relative_to(work).parts:
         report = json.loads(text)
         # How it came about differs between a run and its resumption, seconds and so its checksum do too; what it is
         # about does not.

@@ -177,7 +177,7 @@ def test_image_points_that_count_from_below_are_said(truth: Truth, monkeypatch: 
     images = {image.image_id: image for image in truth.block.images}
 
     def said(points: list[ControlPoint]) -> list[str]:
-        context = SimpleNamespace(control=points, block=truth.block, image_by_id=images)
+        context = SimpleNamespace(given=SimpleNamespace(control=points), block=truth.block, image_by_id=images)
         figures = control_figures(adjusted_truth(truth), cameras(truth), points)
         return control_stage.counted_from_below(context, adjusted_truth(truth), figures)
 
@@ -316,7 +316,7 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
 )
 def test_control_points_of_another_place_are_said(truth: Truth, offset_m: tuple, words: list[str]) -> None:
     """Given positions have 0.5 m: 10 m is the limit."""
-    context = SimpleNamespace(block=truth.block, given=truth.block)
+    context = SimpleNamespace(block=truth.block, given=SimpleNamespace(block=truth.block))
     said = control_stage.control_remarks(context, offset_m)
     assert len(said) == len(words)
     assert all(word in line for word, line in zip(words, said, strict=True))

@@ -37,6 +37,17 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
+def test_a_value_of_the_folder_holds_in_one_state(tmp_path: Path) -> None:
+    path = tmp_path / "index.sqlite"
+    index = Index(path)
+    index.remember("finished", "a state", {"items": 3})
+    index.close()
+    again = Index(path, read_only=True)
+    assert again.recalled("finished", "a state") == {"items": 3}
+    assert again.recalled("finished", "another state") is None
+    assert again.recalled("begun", "a state") is None
+
+
 def test_what_is_known_is_not_read_again_by_another_command(tmp_path: Path, file: Path, reader: Reader) -> None:
     for _ in range(2):
         index = Index(tmp_path / "index.sqlite")

@@ -209,8 +209,8 @@ def test_images_tell_their_views_and_shadow(full):
 
 def test_images_tell_the_views_that_the_steps_of_a_cascade_made(full):
     cascaded = replace(full, settings=full.settings.model_copy(update={"cascade": load("auto").cascade}))
-    write_json(full.workspace.step("first", "first").views("b"), {"views": [{"name": "ground"}]})
-    write_json(full.workspace.step("learned", "learned").enhanced("b", ".json"), {"shadow_share": 0.2})
+    write_json(full.workspace.of_step("first", "first").views("b"), {"views": [{"name": "ground"}]})
+    write_json(full.workspace.of_step("learned", "learned").enhanced("b", ".json"), {"shadow_share": 0.2})
     of_b = gather(cascaded).images[1]
     assert (of_b.views, of_b.shadow) == (1, 0.2)
 
@@ -357,7 +357,7 @@ def test_shards_are_summed_per_stage(tmp_path):
         counts = {"seconds": 1.5, "items": 10, "done": 9, "skipped": 0, "failed": 1}
         write_json(path, {"stage": "match", **counts, "result": None, "failures": []})
         write_json(
-            one.workspace.step("first", "first").stage_report("match", f"{index}-of-2"),
+            one.workspace.of_step("first", "first").stage_report("match", f"{index}-of-2"),
             {"stage": "match", **counts, "result": None, "failures": []},
         )
     (row,) = stage_rows(one.workspace)

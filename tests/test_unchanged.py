@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +14,6 @@ import pytest
 from conftest import PAGE, UNORIENTED, Site, invoke
 
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.files import read_json
 from aeromatch_cli.stages import export, pairs, up_to_date
 
 SETTINGS = UNORIENTED
@@ -55,7 +56,7 @@ def test_the_same_command_again_says_the_same_without_reading_anything(
         lines = invoke("run", "baseline", *done_site.options()).stdout.splitlines()
         return [line.rpartition(",")[0] if line.endswith(" s") else line for line in lines]
 
-    (done_site.work / "finished.json").unlink()
+    (done_site.work / "index.sqlite").unlink()
     before = said()
     assert any(line.startswith("result") for line in before)
     monkeypatch.setattr(pairs, "prepare", None)
@@ -64,6 +65,13 @@ def test_the_same_command_again_says_the_same_without_reading_anything(
     assert short.code == 0
     assert short.done() == {}
     assert short.facts["stages"]["filter"]["result"]["verified_matches"] > 100
+
+
+def finished(site: Site) -> tuple[str, ...] | None:
+    """The row of the index that tells of a finished run."""
+    with closing(sqlite3.connect(site.work / "index.sqlite")) as database:
+        row: tuple[str, ...] | None = database.execute("SELECT * FROM known WHERE path = ''").fetchone()
+    return row
 
 
 def _touched(site: Site) -> None:
@@ -92,7 +100,7 @@ def _another_world(site: Site) -> None:
 
 
 def _damaged_record(site: Site) -> None:
-    (site.work / "finished.json").write_text("{")
+    (site.work / "index.sqlite").write_text("no database")
 
 
 @pytest.mark.parametrize(
@@ -118,7 +126,7 @@ def test_a_version_of_a_library_takes_the_long_way(no_long_way: NoLongWay, monke
 def test_a_run_with_failures_is_tried_again(site: Site) -> None:
     site.image(1).write_bytes(site.image(1).read_bytes()[:2000])
     assert site("run").code == 1
-    assert not (site.work / "finished.json").exists()
+    assert finished(site) is None
 
 
 def test_an_input_that_is_replaced_during_a_run_is_seen(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,17 +139,18 @@ def test_an_input_that_is_replaced_during_a_run_is_seen(done_site: Site, monkeyp
         return found
 
     monkeypatch.setattr(pairs, "prepare", replacing)
-    (done_site.work / "finished.json").unlink()
+    (done_site.work / "index.sqlite").unlink()
     done_site("run")
     monkeypatch.setattr(pairs, "prepare", prepare)
     assert done_site("run").done()
 
 
 def test_files_of_the_workspace_and_the_record_itself_do_not_count_as_inputs(done_site: Site, tmp_path: Path) -> None:
-    before = read_json(done_site.work / "finished.json")
+    before = finished(done_site)
+    assert before is not None
     (tmp_path / "site" / "run.log").write_text("of the shell")
     done_site("run")
-    assert read_json(done_site.work / "finished.json") == before
+    assert finished(done_site) == before
 
 
 def test_an_export_that_failed_is_tried_again(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

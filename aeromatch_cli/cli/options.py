@@ -248,6 +248,15 @@ Overwrite = Annotated[
     bool,
     typer.Option("--overwrite", rich_help_panel=_RESULTS, help="Make every result again, even if it is up to date."),
 ]
+Deep = Annotated[
+    Path | None,
+    typer.Option(
+        "--deep",
+        metavar="WORK",
+        rich_help_panel=_RESULTS,
+        help="Compare every file of a workspace with its checksum, in place of all other checks.",
+    ),
+]
 Strict = Annotated[
     bool,
     typer.Option(

@@ -103,6 +103,17 @@ class Checked(Line):
     estimate: dict[str, Any] = Field(description="Pairs, seconds, megabytes of memory and disk.")
 
 
+class DeepChecked(Line):
+    """Of `check --deep`."""
+
+    command: Literal["check"]
+    workspace: str
+    files: int
+    megabytes: float
+    without_checksum: list[str] = Field(description="Files of which nothing says how they were written.")
+    damaged: dict[str, str] = Field(description="File -> reason.")
+
+
 class Evaluated(Line):
     """Of `evaluate`: the figures of WORK/evaluation/evaluation.json."""
 
@@ -213,7 +224,20 @@ def any_outcome() -> TypeAdapter[Any]:
     """What the line of any command is checked by."""
     stages = (_stages(), Field(description="What each stage did."))
     outcome = create_model("Outcome", __base__=Outcome, stages=stages)
-    kinds = (outcome, Checked, Evaluated, Rendered, Weights, Shown, Compared, Configured, Listed, Begun, Error)
+    kinds = (
+        outcome,
+        Checked,
+        DeepChecked,
+        Evaluated,
+        Rendered,
+        Weights,
+        Shown,
+        Compared,
+        Configured,
+        Listed,
+        Begun,
+        Error,
+    )
     return TypeAdapter(reduce(or_, kinds))
 
 

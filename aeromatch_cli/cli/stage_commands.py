@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from aeromatch_cli.cli.options import (
     ControlMarks,
     ControlPurpose,
     Crs,
+    Deep,
     Exclude,
     ExecutorName,
     Ground,
@@ -131,13 +133,17 @@ STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
     "check": (
         "Dry run that writes nothing: are images readable, poses plausible, weights present; estimates of pairs, time, "
         "memory and disk.",
-        ("aeromatch check --images IMGS", "aeromatch check fusion --images IMGS --poses poses.csv"),
+        (
+            "aeromatch check --images IMGS",
+            "aeromatch check fusion --images IMGS --poses poses.csv",
+            "aeromatch check --deep WORK",
+        ),
     ),
 }
 
 
 def stage_command(name: str) -> Callable[..., None]:
-    """The command of one stage, of `run` or of `check`: all take the same options."""
+    """The command of one stage, of `run` or of `check`: all take the same options, but `--deep`, which is `check`'s."""
 
     def command(
         context: typer.Context,
@@ -161,6 +167,7 @@ def stage_command(name: str) -> Callable[..., None]:
         executor: ExecutorName = None,
         scheduler: Scheduler = None,
         shard: ShardText = None,
+        deep: Deep = None,
         overwrite: Overwrite = False,
         strict: Strict = False,
         keep_images: KeepImages = False,
@@ -179,8 +186,13 @@ def stage_command(name: str) -> Callable[..., None]:
         def call() -> Result:
             from aeromatch_cli import graph
             from aeromatch_cli.config import load
+            from aeromatch_cli.stages import deep_check
             from aeromatch_cli.stages.run import execute
 
+            if deep is not None:
+                if config is not None or any(value is not None for value in block.values()):
+                    raise ConfigError("--deep looks at a workspace alone: leave out the preset and all of the block")
+                return deep_check.run(deep)
             if strict and name not in _JUDGED:
                 raise ConfigError(f"--strict is for {' and '.join(_JUDGED)}: {name} does not say how good the block is")
             if scheduler and executor not in (None, "dask"):
@@ -202,6 +214,10 @@ def stage_command(name: str) -> Callable[..., None]:
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context, strict=strict)
 
+    if name != "check":
+        every = inspect.signature(command, eval_str=True)
+        own = [option for option in every.parameters.values() if option.name != "deep"]
+        command.__signature__ = every.replace(parameters=own)  # type: ignore[attr-defined]
     return command
 
 

@@ -29,12 +29,17 @@ The resolved configuration, every default included. `aeromatch run WORK/config.y
 - `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
 - `ground_fingerprint`: of the setting that the ground comes from.
 
-### finished.json
+### index.sqlite
 
-Written at the end of a run without a failure: `settings`, `program`, `inputs` and `files` are digests of the settings,
-of the program and its libraries, and of the size and times of every input and every file of the workspace; `stages`:
-items of each stage, and its result where no report holds it. Where all are as they were, `aeromatch run` says at once
-that everything is up to date; anything else is looked into. May be deleted.
+What is known of the files, so that no command reads a file twice to learn the same thing. One table, `known`: `what`
+(what was learnt, with a number that changes with the reader), `path` (below the workspace, or the whole path of a
+picture), `status` (size, times of the last change of the contents and of the file in nanoseconds, inode: the row holds
+as long as the file has it), `value` (JSON), `checksum` (CRC-32 of the other columns). Rows tell of features, matches
+and verdicts their fingerprints, numbers, states and reasons, of pictures what their headers state, of other files their
+SHA-256. The row `finished run` has instead of a status a digest of the settings, the program, and the status of every
+input and every file: where it is the same, `aeromatch run` says at once that everything is up to date. Shards write
+`index.<i>-of-<n>.sqlite`, which the run without `--shard` merges. All of it can be read from the files again: an index
+may be deleted.
 
 ### images.csv
 
@@ -191,15 +196,16 @@ With a `cascade` these are the keypoints of all steps that looked at the image, 
 `keypoints_px`, `sizes_px`, `responses`; `kinds` (S,) str: names of the steps; `kind_idx` (K,) uint8: the first of them
 that found a keypoint; `numbers_<step>` (K_step,) int32: number here of each keypoint of the step's own file.
 
-### steps.csv, steps/<step>/
+### steps.csv, and the files of each step
 
 Only with a `cascade`. `image_id0`, `image_id1`, `steps` (those that the pair took, joined by +), `reasons` (why it took
 the further ones), `settled_by` (the step after which it needed nothing more, empty where it lacks matches in the end),
 `lacks` (what it lacks in the end), `verified` (verified matches of all steps, those that two of them have found counted
 once, before the pair is verified as a whole), `expected` (how many were expected after the last step that it took;
-empty where overlap or view angle are unknown, or nothing is known of the step). Features, matches and verdicts of a
-step lie in its folder, laid out like this workspace; the workspace's own join them. `guided` has no features: it uses
-those of the first step.
+empty where overlap or view angle are unknown, or nothing is known of the step). What a step makes lies
+in a folder of its name, written like the files of the block that join it: `features/<step>/`, `matches/<step>/`,
+`verified/<step>/`, `simulated/<step>/`, `enhanced/<step>/`, `reports/<step>/`. `guided` has no features: it uses those
+of the step `first`.
 
 ### matches/<id0>.npz
 

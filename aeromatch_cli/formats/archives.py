@@ -80,6 +80,12 @@ def load_checked(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         return {name: _array(members[f"{name}.npy"]) for name in names}
 
 
+def check_archive(path: Path) -> None:
+    """Compare every byte of an archive with its checksums. Raises BrokenFileError."""
+    with readable(path, *ARCHIVE_FAULTS):
+        _members(path.read_bytes())
+
+
 def _members(data: bytes) -> dict[str, bytes]:
     """All members of an archive, every byte of which is compared with a checksum."""
     _check_whole(data)

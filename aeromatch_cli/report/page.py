@@ -77,7 +77,7 @@ def run(context: Context) -> StageReport:
     with settled():
         page = render(context, found, adjustment)
     write_text(context.workspace.report, page)
-    report.vouches_for(context.workspace, (p for p in context.workspace.report.parent.rglob("*") if p.is_file()))
+    report.vouches_for(context, (p for p in context.workspace.report.parent.rglob("*") if p.is_file()))
     report.done = 1
     report.result = ReportResult(page="report/index.html", bytes=len(page.encode("utf-8")), of_results=results)
     return report.write(context.workspace)

@@ -148,7 +148,7 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
 
 def _reports(workspace: Workspace) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Of all stages, and of the shards of a cascade's steps."""
-    in_steps = (workspace.root / "steps").glob("*/reports/*-of-*.json")
+    in_steps = workspace.reports.glob("*/*-of-*.json")
     for path in (*sorted(workspace.reports.glob("*.json")), *sorted(in_steps)):
         yield path, read_json(path)
 

@@ -62,7 +62,7 @@ def run(context: Context) -> StageReport:
     residuals = _residuals(context, adjusted)
     report.result = _result(context, adjusted, found, residuals)
     report.done = report.items
-    report.vouches_for(context.workspace, _write(context, adjusted, residuals))
+    report.vouches_for(context, _write(context, adjusted, residuals))
     return report.write(context.workspace)
 
 

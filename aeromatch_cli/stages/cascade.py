@@ -1,11 +1,10 @@
 """cascade: steps from cheap to expensive, each for the pairs that those before it leave with too few matches.
 
-Every step is a small workspace of its own below WORK/steps, made by the stages extract, match and filter. A pair takes
-a further step where its verified matches are few for its overlap or leave parts of it empty, or where learned features
-may bring many more. Whether it does
-depends on this pair, and of steps whose features cost much and matches little on others of its images: a shard takes
-such pairs as far as it sees them, the command that ends the work of all shards the rest. `union` joins what the steps
-have found.
+The stages extract, match and filter make each step; its files lie in folders of its name beside those of the block. A
+pair takes a further step where its verified matches are few for its overlap or leave parts of it empty, or where
+learned features may bring many more. Whether it does depends on this pair, and of steps whose features cost much and
+matches little on others of its images: a shard takes such pairs as far as it sees them, the command that ends the work
+of all shards the rest. `union` joins what the steps have found.
 """
 
 from __future__ import annotations
@@ -133,7 +132,6 @@ def run(context: Context) -> list[StepContext]:
     done = []
     for step in _steps(context):
         own = step.context
-        own.workspace.create()
         # All images in the first step: what failed there is told of those, too, that are in no pair.
         ids = match.images_of_rows(own) if step.name == FIRST else match.paired_images(own)
         # Features of the first step are made once, also where everything is made anew.
@@ -204,7 +202,7 @@ def makers(settings: Settings, workspace: Workspace) -> list[Workspace]:
     if not settings.cascade:
         return [workspace]
     names = FIRST, *(recipe.name for recipe in settings.cascade if recipe.own_features)
-    return [workspace.step(name, name) for name in names]
+    return [workspace.of_step(name, name) for name in names]
 
 
 def further(context: Context) -> list[StepContext]:
@@ -230,7 +228,7 @@ def _step(context: Context, name: str, features_of: str, settings: Settings, rea
     own = replace(
         context,
         settings=settings,
-        workspace=context.workspace.step(name, features_of),
+        workspace=context.workspace.of_step(name, features_of),
         scope=replace(context.scope, chosen=frozenset(reasons), part=f"step {name}: "),
     )
     return StepContext(name, features_of, own, reasons)

@@ -72,7 +72,7 @@ def run(context: Context) -> StageReport:
     if block is not adjusted:
         write_atomically(context.workspace.final, lambda stream: write_adjusted(stream, block))
         files.append(context.workspace.final)
-    report.vouches_for(context.workspace, files)
+    report.vouches_for(context, files)
     left = _connection_left(context, entries)
     matches = sum(len(before.matches.indices) for _, before in entries)
     report.result = ConsistencyResult(

@@ -55,7 +55,7 @@ def run(context: Context) -> StageReport:
     alone = replace(context, executor=Executor("serial", 1, context.executor.progress))
     done = run_stage(alone, report, _run_task, tasks, names)
     report.result = ExportResult(exporters={one.name: one for one in done})
-    report.vouches_for(context.workspace, (context.workspace.export(one.name) / n for one in done for n in one.files))
+    report.vouches_for(context, (context.workspace.export(one.name) / n for one in done for n in one.files))
     report.failures += unexplained(context, outdated, "filter")
     return report.write(context.workspace)
 

@@ -109,8 +109,9 @@ def run_task(task: MatchTask) -> RowResult[KnownMatches]:
     old = rows.readable(read_match_row, path, task.overwrite)
     features0 = _features(task.workspace.features(task.image_id0))
     ahead = matched_in_batches(task.matchers, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
-    first = task.workspace.features_of
-    scanned = None if first is None else read_match_row(first.matches(task.image_id0))
+    maker = task.workspace.features_of
+    own = maker == task.workspace.step
+    scanned = None if own else read_match_row(task.workspace.of_step(maker, maker).matches(task.image_id0))
     row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead, scanned))
     write_atomically(path, lambda stream: write_match_row(stream, row.entries))
     found = sum(len(entry.matches.indices) for entry in row.made)

@@ -95,7 +95,7 @@ def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) 
     else:
         lines.append("all images are connected")
     if found.weakly_tied:
-        lines.append(f"weakly tied (< {WEAK_MATCHES} matches): {_listed([names[i] for i in found.weakly_tied])}")
+        lines.append(f"weakly tied (< {WEAK_MATCHES} matches): {listed([names[i] for i in found.weakly_tied])}")
     return lines
 
 
@@ -110,11 +110,11 @@ def orientation_lines(found: OrientResult, given: Block, block: Block) -> list[s
     given_wrongly = ("attitudes", "degrees", found.wrong_attitudes), ("positions", "m", found.wrong_positions)
     for what, unit, wrong in given_wrongly:
         if wrong:
-            named = _listed([f"{names[i]} ({value:.0f} {unit})" for i, value in wrong.items()])
+            named = listed([f"{names[i]} ({value:.0f} {unit})" for i, value in wrong.items()])
             done = "kept, as orient=given asks" if found.stays else "those that the pictures give are used"
             words.append(f"wrong {what} given; {done}: {named}")
     if found.outside:
-        words.append(f"not oriented: {_listed([names[i] for i in found.outside])}")
+        words.append(f"not oriented: {listed([names[i] for i in found.outside])}")
     return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]
 
 
@@ -191,7 +191,7 @@ def _adjust_lines(found: AdjustResult, images: int, names: Mapping[str, str]) ->
 
 def _consistency_lines(found: ConsistencyResult, names: Mapping[str, str]) -> list[str]:
     """Say what was dropped, and which images the adjusted block seems to hold in a wrong place."""
-    doubtful = _listed([names[i] for i in found.doubtful])
+    doubtful = listed([names[i] for i in found.doubtful])
     lines = [f"too many matches contradict the adjusted poses of {doubtful}"] if doubtful else []
     if found.spread:
         lines.append(_spread_words(found))
@@ -234,9 +234,9 @@ def control_words(control: Control | None, adjusted: Sequence[ControlInGroup] = 
     if control.points and len(control.not_measured_in_two_images) == control.points:
         return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
     apart = control.rays_do_not_meet
-    wrong = [f"rays do not meet of {_listed(apart)}: measured at another place in one image?"] if apart else []
+    wrong = [f"rays do not meet of {listed(apart)}: measured at another place in one image?"] if apart else []
     if once := control.not_measured_in_two_images:
-        wrong.append(f"warning: points that are not measured in two oriented images are left out: {_listed(once)}")
+        wrong.append(f"warning: points that are not measured in two oriented images are left out: {listed(once)}")
     taking_part = [words for one in adjusted for words in _adjusted_words(one)]
     if any(one.used for one in adjusted) or (taking_part and not control.control):
         return [counts, *wrong, *taking_part]
@@ -250,7 +250,7 @@ def control_words(control: Control | None, adjusted: Sequence[ControlInGroup] = 
     if control.check_rmse_m is not None and control.check_kind is not None:
         words[-1] += f", at {_CHECKED[control.check_kind]} {_axes(control.check_rmse_m)} m"
     if control.doubtful:
-        words.append(f"control points that the others contradict: {_listed(control.doubtful)}")
+        words.append(f"control points that the others contradict: {listed(control.doubtful)}")
     return words
 
 
@@ -263,9 +263,9 @@ def _adjusted_words(control: ControlInGroup) -> Iterator[str]:
     if control.fault:
         yield f"warning: the control points fit the block if {control.fault}: correct the list"
     if control.exchanged:
-        yield f"names of control points that are exchanged: {_listed(control.exchanged)}; they were left out"
+        yield f"names of control points that are exchanged: {listed(control.exchanged)}; they were left out"
     if control.wrong:
-        yield f"control points that the others contradict: {_listed(control.wrong)}; they were left out"
+        yield f"control points that the others contradict: {listed(control.wrong)}; they were left out"
     with_m, without_m = control.held_out_rms_m, control.without_rms_m
     held_out = "check points" if control.held_out == "check points" else "control points left out in turn"
     errors = "" if with_m is None else f"; RMSE at {held_out}: {_axes(with_m)} m"
@@ -278,5 +278,6 @@ def _adjusted_words(control: ControlInGroup) -> Iterator[str]:
         yield f"the control points were left out of the adjustment, since they make it no better{errors}"
 
 
-def _listed(names: list[str], shown: int = 10) -> str:
+def listed(names: Sequence[str], shown: int = 10) -> str:
+    """Return names in words, the first of many."""
     return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")

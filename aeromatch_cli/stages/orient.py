@@ -83,11 +83,11 @@ def run(
         report.done = report.items
     else:
         report.skipped = report.items
-    report.vouches_for(context.workspace, _files(context, record))
+    report.vouches_for(context, _files(context, record))
     folder = context.workspace.orientation
     found = OrientResult(**record["result"])
     ground, source, ground_remarks = judged_ground(context, _terrains(context, record), found)
-    remarks = [*found.remarks, *frame_remarks(found, groups(context)), *ground_remarks]
+    remarks = [*found.remarks, *frame_remarks(found, _groups(record)), *ground_remarks]
     remarks += judged_altitudes(ground, context.block, found, altitudes)
     report.result = found.model_copy(update={"remarks": remarks})
     if found.frame == "own":
@@ -126,7 +126,10 @@ def _failed_images(context: Context, failed: Sequence[str]) -> list[tuple[str, s
 
 def groups(context: Context) -> list[Group]:
     """Return images that the orientation on file holds, the largest group first; none without an orientation."""
-    record = _on_file(context.with_scope(overwrite=False))
+    return _groups(_on_file(context.with_scope(overwrite=False)))
+
+
+def _groups(record: Mapping[str, Any]) -> list[Group]:
     return [Group(str(one["kind"]), tuple(one["images"])) for one in record.get("groups", ()) if one["images"]]
 
 

@@ -94,7 +94,7 @@ def prepare(
     warn(said_later)
     _check_pairs(context)
     if not dry:
-        report.vouches_for(workspace, _write(context, pairs_csv, quality))
+        report.vouches_for(context, _write(context, pairs_csv, quality))
         forget_absent(context)
         report.write(workspace)
     return context, oriented, report

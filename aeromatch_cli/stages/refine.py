@@ -67,7 +67,7 @@ def run(context: Context) -> StageReport:
     found = _measured(context, table, recipe, report)
     report.result = _write(context, table, found, recipe)
     report.done = report.items - len(report.failures)
-    report.vouches_for(context.workspace, folder.glob("*.npz"))
+    report.vouches_for(context, folder.glob("*.npz"))
     return report.write(context.workspace)
 
 

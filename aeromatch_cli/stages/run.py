@@ -91,7 +91,7 @@ def execute(
             stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
         try:
             whole = command == "run" and part is None
-            inputs = up_to_date.state_of_inputs(settings) if whole else {}
+            inputs = up_to_date.state_of_inputs(settings) if whole else ""
             before = None if overwrite else up_to_date.unchanged_reports(Workspace(root), inputs)
             if before is not None:
                 return named(_unchanged(settings, before, Said(say)), root)
@@ -101,8 +101,8 @@ def execute(
                 _index(Workspace(root.absolute()), command, part) as index,
             ):
                 result = _repairing(command, settings, executor, index, part, overwrite, Said(say))
-            if whole and not result.failures:
-                up_to_date.remember(Workspace(root), inputs, result.reports)
+                if inputs and not result.failures:
+                    up_to_date.remember(Workspace(root), index, inputs, result.reports)
             return named(result, root)
         except BaseException as error:
             # Workers are stopped in the middle of what they write.

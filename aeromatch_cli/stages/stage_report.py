@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from aeromatch_cli import graph
 from aeromatch_cli.data import Pair
 from aeromatch_cli.executor import Outcome
-from aeromatch_cli.files import changed_files, digests, read_json, translated_os_errors, write_json, write_text
+from aeromatch_cli.files import read_json, translated_os_errors, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.results.stages import StageResult
 from aeromatch_cli.stages.context import Context
@@ -89,9 +89,10 @@ class StageReport:
         told = old.get("failures"), old.get("fingerprint"), old.get("files", {}), before
         return told == (failures, self.fingerprint, self.files, self.result)
 
-    def vouches_for(self, workspace: Workspace, paths: Iterable[Path]) -> None:
+    def vouches_for(self, context: Context, paths: Iterable[Path]) -> None:
         """State the files that the stage has written, as they are now."""
-        self.files = digests(workspace.root, (path.relative_to(workspace.root).as_posix() for path in paths))
+        root = context.workspace.root
+        self.files = {path.relative_to(root).as_posix(): context.store.digest(path) for path in sorted(paths)}
 
     def is_up_to_date(self, context: Context) -> bool:
         """Whether what a stage of the whole block has left is of this report's fingerprint, and as it was written. Then
@@ -112,7 +113,7 @@ def whole_record(context: Context, stage: str) -> dict[str, Any]:
     if context.scope.overwrite or not path.is_file():
         return {}
     record = read_json(path)
-    changed = changed_files(workspace.root, record.get("files", {}))
+    changed = context.store.changed(workspace.root, record.get("files", {}))
     if changed:
         more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
         log.warning(
@@ -145,8 +146,8 @@ def _shard_failed_since(path: Path) -> bool:
 
 
 def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
-    """Write failures.csv anew from the reports of all stages; return its rows (stage, item, reason), with ids as
-    reports have them, where the file has names.
+    """Return the failures (stage, item, reason) in the reports of all stages, with ids as reports have them. Those of
+    the block, not of a cascade's step, are written to failures.csv, with names.
 
     What a later report of the same stage covers (the whole block, or a shard that owns the item) supersedes what an
     earlier one says of that item.
@@ -166,7 +167,8 @@ def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
     ordered = sorted(once(rows))
     names = names_on_file(workspace) if ordered else {}
     shown = [(stage, item_named(item, names), reason) for stage, item, reason in ordered]
-    write_text(workspace.failures, csv_text(("stage", "item", "reason"), shown))
+    if not workspace.step:
+        write_text(workspace.failures, csv_text(("stage", "item", "reason"), shown))
     return ordered
 
 

@@ -1,16 +1,17 @@
 """This module recognises a finished run of which nothing has changed since, so that the same command need not look into
 it.
 
-The record WORK/finished.json holds digests of the status (size, times of the last change of contents and of the file)
-of every input and every file of the workspace, and of the settings, the program and its libraries. Where all are the
-same, every stage is up to date. Anything else, and any failure, takes the long way, which looks at contents.
+The index keeps what the stages have told, with a digest of the settings, the program, its libraries, and the status
+(size, times of the last change of contents and of the file) of every input and every file of the workspace. Where it is
+the same, every stage is up to date. Anything else, and any failure, takes the long way, which looks at each result.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,51 +19,47 @@ from aeromatch_cli import graph
 from aeromatch_cli.blocks.left_out import list_files
 from aeromatch_cli.config import PATH_KEYS, Settings, dump
 from aeromatch_cli.errors import BrokenFileError, ConfigError
-from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.stages.pairs import chosen_strategies
 from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.stages.versions import library_version
+from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace
 
+# What the index calls the state of a finished run.
+_FINISHED = "finished run"
 # Their arithmetic decides results.
 _LIBRARIES = ("numpy", "opencv-python-headless", "poselib", "pycolmap", "torch")
 # What readers of poses and cameras look for beside the file or folder that is named, and one folder above.
 _KINDS_BESIDE, _NAMES_BESIDE = (".bin", ".xml", ".xyz"), ("block.json", "world.json", "list.txt")
 
 
-def state_of_inputs(settings: Settings) -> dict[str, str]:
-    """Return digests of what a run starts from; {} where that cannot be told, as images lie on another machine.
+def state_of_inputs(settings: Settings) -> str:
+    """Return a digest of what a run starts from; "" where that cannot be told, as images lie on another machine.
 
     To be asked before anything is read: what is replaced while a run reads it is no longer what it was then.
     """
     if not settings.block.images or is_remote(settings.block.images):
-        return {}
+        return ""
     root = Path(settings.workspace)
     libraries = [f"{name} {library_version(name)}" for name in _LIBRARIES]
     own = (path for path in _files_below(Path(__file__).parent.parent, ()) if path.suffix != ".pyc")
     try:
         inputs = sorted(set(_inputs(settings, root)))
     except (ConfigError, OSError):  # a file is missing or may not be read: the run itself says so
-        return {}
-    return {
-        "settings": _digest([dump(settings)]),
-        "program": _digest([*libraries, *_statuses(own)]),
-        "inputs": _digest(_statuses(inputs)),
-    }
+        return ""
+    return _digest([dump(settings), *libraries, *_statuses(own), *_statuses(inputs)])
 
 
-def unchanged_reports(workspace: Workspace, inputs: Mapping[str, str]) -> list[StageReport] | None:
+def unchanged_reports(workspace: Workspace, inputs: str) -> list[StageReport] | None:
     """Return what the run from these inputs has left, as reports of stages that have made nothing; None where anything
     has changed since, or it left no record."""
-    if not inputs or not workspace.finished.is_file():
+    if not inputs or not workspace.index.is_file():
         return None
+    with closing(Index(workspace.index, read_only=True)) as index:
+        told = index.recalled(_FINISHED, _state(workspace, inputs))
     try:
-        record = read_json(workspace.finished)
-        now = {**inputs, "files": _state_of_files(workspace)}
-        if any(record.get(key) != value for key, value in now.items()):
-            return None
-        return [_report(workspace, stage, **own) for stage, own in record["stages"].items()]
+        return None if told is None else [_report(workspace, stage, **own) for stage, own in told.items()]
     except BrokenFileError:  # the long way makes it again
         return None
 
@@ -74,16 +71,16 @@ def _report(workspace: Workspace, stage: str, *, items: int, result: Any) -> Sta
     return StageReport(stage, items=items, skipped=items, result=found)
 
 
-def remember(workspace: Workspace, inputs: Mapping[str, str], reports: Sequence[StageReport]) -> None:
-    """Write the record of a run that has ended without a failure. inputs: from before it began. reports: of its stages,
-    in order; results that are on file are not written once more."""
+def remember(workspace: Workspace, index: Index, inputs: str, reports: Sequence[StageReport]) -> None:
+    """Keep what the stages of a run that has ended without a failure have told. inputs: from before it began. reports:
+    of its stages, in order; results that are on file are not kept once more."""
     if not inputs:
         return
     told = {}
     for one in reports:
         known = one.result is None or one.result == result_on_file(workspace, graph.BY_NAME[one.stage].result)
         told[one.stage] = {"items": one.items, "result": None if known or one.result is None else one.result.as_json()}
-    write_json(workspace.finished, {**inputs, "files": _state_of_files(workspace), "stages": told})
+    index.remember(_FINISHED, _state(workspace, inputs), told)
 
 
 def _inputs(settings: Settings, root: Path) -> Iterator[Path]:
@@ -122,9 +119,11 @@ def _files_below(folder: Path, passed_over: Iterable[Path]) -> Iterator[Path]:
         yield from (Path(parent, name) for name in sorted(files))
 
 
-def _state_of_files(workspace: Workspace) -> str:
-    passing = {workspace.lock, workspace.finished}
-    return _digest(_statuses(path for path in _files_below(workspace.root, ()) if path not in passing))
+def _state(workspace: Workspace, inputs: str) -> str:
+    """Return a digest of the inputs and of the files of the workspace, without the index itself."""
+    passing = {workspace.lock.absolute(), workspace.index}
+    files = (path for path in _files_below(workspace.root.absolute(), ()) if path not in passing)
+    return _digest([inputs, *_statuses(files)])
 
 
 def _statuses(paths: Iterable[Path]) -> Iterator[str]:

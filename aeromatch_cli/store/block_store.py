@@ -114,7 +114,11 @@ class BlockStore:
 
     def changed(self, folder: Path, digests: Mapping[str, str]) -> list[str]:
         """Return the names of files below a folder that are gone or have other digests than these."""
-        return changed_files(folder, digests, lambda path: str(self.index.known(_DIGEST, path, file_digest)))
+        return changed_files(folder, digests, self.digest)
+
+    def digest(self, path: Path) -> str:
+        """Return the SHA-256 of a file, which is read where it has changed since that was asked last."""
+        return str(self.index.known(_DIGEST, path, file_digest))
 
     def _known(self, what: str, path: Path, read: Callable[[Path], Any]) -> Any:
         try:

@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.errors import BrokenFileError
+
 log = logging.getLogger("aeromatch")
 
 _SCHEMA = """
@@ -73,6 +75,15 @@ class Index:
     def learn(self, what: str, path: Path, value: Any) -> None:
         """Keep what `read` would find in a file that has just been written, by the word of the worker that wrote it."""
         self._keep((what, self._name(path)), _status(path), value)
+
+    def remember(self, what: str, state: str, value: Any) -> None:
+        """Keep one value of the whole folder, which holds in a state that a digest tells."""
+        self._keep((what, ""), state, value)
+
+    def recalled(self, what: str, state: str) -> Any | None:
+        """Return what was kept of the folder in this state; None where that is not known."""
+        held = self._found.get((what, "")) or self._stored((what, ""))
+        return held[1] if held is not None and held[0] == state else None
 
     def _keep(self, key: tuple[str, str], status: str, value: Any) -> None:
         self._found[key] = status, value
@@ -144,6 +155,17 @@ class Index:
     def __getstate__(self) -> dict[str, Any]:
         """A copy in another process knows nothing and writes nothing."""
         return {"_path": None, "_folder": "", "_read_only": True, "_found": {}, "_new": {}, "_reader": None}
+
+
+def check_index(path: Path) -> None:
+    """Compare every row of an index with its checksum. Raises BrokenFileError."""
+    try:
+        with _connected(f"{path.absolute().as_uri()}?mode=ro") as database:
+            sound = [_is_sound(row) for row in database.execute("SELECT * FROM known")]
+    except _FAULTS as error:
+        raise BrokenFileError(str(path), str(error)) from None
+    if not all(sound):
+        raise BrokenFileError(str(path), f"{len(sound) - sum(sound)} of {len(sound)} rows contradict their checksums")
 
 
 @contextlib.contextmanager
