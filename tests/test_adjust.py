@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import pickle
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import forked
 import numpy as np
 import pytest
 from conftest import IMAGES, Site
@@ -26,7 +28,8 @@ from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, to_omega_phi_kappa
 from aeromatch_cli.lab.synthetic import load_truth
-from aeromatch_cli.sfm.mapping import Group, Observed, adjust_block
+from aeromatch_cli.sfm import process
+from aeromatch_cli.sfm.mapping import Group, Observed, adjust_block, map_block
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.strategies.exporters import Colmap, ExportContents
 
@@ -91,6 +94,17 @@ def test_disturbed_poses_are_adjusted_to_the_truth(truth: Truth) -> None:
     assert len(adjusted.points_m) >= 0.95 * truth.tied
     assert float(np.mean(adjusted.errors_px)) < 2 * NOISE_PX
     assert (figures[0].images, figures[0].points) == (6, len(adjusted.points_m))
+
+
+def test_a_mapper_makes_the_same_bytes_again(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two runs, of which the second is no copy of the first: `forked.kept_run` relies on it."""
+    observed = Observed(given_positions(truth, 100, 0.1), FOCAL_SIGMAS, {})
+    adjusted, _ = refined(truth)
+    mapped = map_block(disturbed(truth, 0), observed, "global")
+    monkeypatch.setattr(process, "subprocess", SimpleNamespace(run=forked.run))
+    again, _ = adjust_block(disturbed(truth, 0), observed, [Group("positions", IMAGE_IDS)], fixed=False)
+    mapped_again = map_block(disturbed(truth, 0), observed, "global")
+    assert [pickle.dumps(one) for one in (adjusted, *mapped)] == [pickle.dumps(one) for one in (again, *mapped_again)]
 
 
 def test_points_are_those_that_their_keypoints_see(truth: Truth) -> None:
