@@ -112,6 +112,7 @@ def test_no_enhancement_writes_no_pictures(site):
     assert len(list(site.work.glob("simulated/*/*.png"))) == IMAGES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["simulate", "extract", "run"])
 def test_the_summary_tells_what_views_cost(site, command):
     stage = "simulate" if command == "simulate" else "extract"
@@ -138,6 +139,7 @@ def test_commands_that_need_an_earlier_one_say_so(site):
     assert site("export").code == 0
 
 
+@pytest.mark.slow
 def test_report_alone_shows_an_empty_block(site):
     assert site("report").code == 0
     assert "No pair is verified" in (site.work / "report" / "index.html").read_text()
@@ -310,6 +312,7 @@ def test_weights_commands(tmp_path, monkeypatch):
     assert "absent.pth" in outcome.stderr
 
 
+@pytest.mark.slow
 def test_settings_come_from_a_file_and_options_win(site):
     config = site.root / "my.yaml"
     config.write_text(

@@ -87,6 +87,7 @@ def test_the_budget_is_for_the_image_or_for_each_view():
     assert np.array_equal(*alone)
 
 
+@pytest.mark.slow
 def test_few_keypoints_of_a_large_view_are_those_of_a_reduced_one():
     gray, valid, keypoints = texture(1800, 1400), np.ones((1400, 1800), bool), 800
     valid[:, 1500:] = False
@@ -102,6 +103,7 @@ def test_few_keypoints_of_a_large_view_are_those_of_a_reduced_one():
     assert np.abs(np.median(offset, axis=0)).max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_view_is_not_reduced_where_it_would_have_too_few_keypoints():
     dull = np.full((1300, 1300), 90, np.uint8)
     dull[:300, :300] = texture(300, 300)
@@ -110,6 +112,7 @@ def test_a_view_is_not_reduced_where_it_would_have_too_few_keypoints():
     assert len(extract(dull, **settings).descriptors) == len(extract(dull, keypoints=1000).descriptors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [{}, {"sigma": 2.4}, {"selection": "scale"}])
 def test_a_view_is_not_reduced_where_its_strongest_blobs_are_the_smallest(more):
     noise = np.random.default_rng(3).normal(0.0, 40.0, (1300, 1300)).astype(np.float32)
