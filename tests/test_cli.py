@@ -67,13 +67,6 @@ def test_version():
     assert (outcome.code, outcome.stdout.strip()) == (0, __version__)
 
 
-def test_importing_the_command_line_loads_nothing_heavy():
-    heavy = ("numpy", "cv2", "torch", "scipy", "yaml", "pydantic", "rasterio", "pycolmap", "matplotlib")
-    code = f"import sys, aeromatch_cli.cli; print([name for name in {heavy} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 @pytest.mark.slow
 def test_stage_by_stage_gives_what_run_gives(done_site):
     work = done_site.root / "stages"
