@@ -6,6 +6,7 @@ import csv
 import fcntl
 import hashlib
 import json
+import multiprocessing
 import os
 import shutil
 import signal
@@ -13,7 +14,7 @@ import sqlite3
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +22,9 @@ from typing import Any
 import cv2
 import forked
 import pytest
+import threadpoolctl
 import typer.testing
+from benchmarks import processes
 from hypothesis import settings
 from typer.testing import CliRunner
 
@@ -116,10 +119,28 @@ def command_line_made_once() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def mappers_forked() -> Iterator[None]:
-    """Mappers and refiners of commands that run in this process do not load their libraries each time."""
+def mappers_forked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Mappers and adjustments of commands that run in this process do not load their libraries each time, and are run
+    once for the same input; processes of benchmarks do not load theirs either."""
+    kept = _shared(tmp_path_factory) / "mapped"
+    forks = SimpleNamespace(get_context=lambda _: multiprocessing.get_context("forkserver"))
     with forked.server(), pytest.MonkeyPatch.context() as patched:
-        patched.setattr(process, "subprocess", SimpleNamespace(run=forked.run))
+        patched.setattr(process, "subprocess", SimpleNamespace(run=partial(forked.kept_run, kept)))
+        patched.setattr(processes, "multiprocessing", forks)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def libraries_listed_once() -> Iterator[None]:
+    """Serial work asks for the threads of all loaded libraries, whose list takes 8 ms to make, a dozen times in a
+    run."""
+    listed = lru_cache(maxsize=1)(lambda _modules: threadpoolctl.ThreadpoolController())
+
+    def limited(limits: int) -> Any:
+        return listed(len(sys.modules)).limit(limits=limits)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(threadpoolctl, "threadpool_limits", limited)
         yield
 
 
@@ -186,10 +207,15 @@ class Site:
         return self.root / name
 
 
+def _shared(factory: pytest.TempPathFactory) -> Path:
+    """The folder of a session, of all its processes."""
+    base = factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
 def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
     """The folder of a session, made by whichever process of pytest-xdist needs it first; the others wait for it."""
-    base = factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder = _shared(factory) / name
     finished = folder.with_name(f"{name}.made")
     with folder.with_name(f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # of a process that dies it is taken

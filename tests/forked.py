@@ -3,6 +3,9 @@ they need for a small block, and a run has two or three of them.
 
 A fork runs the module as `python -m` does, with the same arguments, environment, folder, output and exit code. Commands
 that tests start as processes of their own have no part in this: their mappers start as a user's do.
+
+Tests run the same small block through the same settings again and again. What a mapper makes of a folder depends on the
+files in it alone (`test_a_mapper_makes_the_same_bytes_again`): it is kept by their contents, and made once.
 """
 
 from __future__ import annotations
@@ -11,18 +14,22 @@ import importlib
 import multiprocessing
 import os
 import runpy
+import shutil
 import subprocess
 import sys
 import tempfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import forkserver
 from pathlib import Path
 from unittest import mock
 
+from aeromatch_cli.fingerprints import contents_digest, fingerprint
 from aeromatch_cli.workers import ONE_THREAD
 
+# Modules that read the files of the folder that they are given and no others.
+_OF_A_FOLDER = ("aeromatch_cli.sfm.mapping_process", "aeromatch_cli.sfm.adjustment_process")
 # Not the modules that are run: they would be there twice.
 _LIBRARIES = ("pycolmap", "scipy.linalg", "scipy.optimize", "scipy.sparse.linalg", "scipy.spatial.transform")
 
@@ -30,6 +37,30 @@ if multiprocessing.current_process().name != "MainProcess" or sys.argv[:1] == ["
     zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
     for _name in _LIBRARIES:
         importlib.import_module(_name)
+
+
+def kept_run(
+    kept: Path, command: Sequence[str], *, env: Mapping[str, str], **_: object
+) -> subprocess.CompletedProcess[str]:
+    """The same as `run`; what a module makes of a folder comes from `kept` where it was made before."""
+    module, folder = command[2], Path(command[-1])
+    if module not in _OF_A_FOLDER:
+        return run(command, env=env)
+    given = {str(path.relative_to(folder)): contents_digest(path) for path in folder.rglob("*") if path.is_file()}
+    place = kept / fingerprint(module, given)
+    if place.is_dir():
+        shutil.copytree(place, folder, dirs_exist_ok=True)
+        return subprocess.CompletedProcess(command, 0, "", "")
+    done = run(command, env=env)
+    if done.returncode == 0:
+        kept.mkdir(exist_ok=True)
+        made = Path(tempfile.mkdtemp(dir=kept))
+        for path in folder.iterdir():
+            if path.is_file() and path.name not in given:
+                shutil.copy2(path, made)
+        with suppress(OSError):  # another process was faster
+            made.rename(place)
+    return done
 
 
 def run(command: Sequence[str], *, env: Mapping[str, str], **_: object) -> subprocess.CompletedProcess[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from benchmarks.polar.sides import Shot
@@ -10,8 +12,9 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray
 
 
+@lru_cache(maxsize=8)
 def ground(seed: int, size: tuple[int, int] = (1400, 1100)) -> NDArray[np.float32]:
-    """(H, W) of size (W, H): gray values around 120 whose spectrum falls as natural ground's does."""
+    """(H, W) of size (W, H), read-only: gray values around 120 whose spectrum falls as natural ground's does."""
     rng = np.random.default_rng(seed)
     width, height = size
     down, across = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)
@@ -19,7 +22,9 @@ def ground(seed: int, size: tuple[int, int] = (1400, 1100)) -> NDArray[np.float3
     spectrum = np.fft.rfft2(rng.standard_normal((height, width))) / wave**1.2
     spectrum[0, 0] = 0.0
     values = np.fft.irfft2(spectrum, (height, width))
-    return (120.0 + 30.0 * values / values.std()).astype(np.float32)
+    gray = (120.0 + 30.0 * values / values.std()).astype(np.float32)
+    gray.flags.writeable = False
+    return gray
 
 
 def similarity(turn_deg: float, scale: float, at: tuple[float, float], to: tuple[float, float]) -> FloatArray:

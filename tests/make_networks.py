@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
@@ -20,6 +21,12 @@ from aeromatch_cli.sfm.model_adjustment import Given
 
 WIDTH_PX, HEIGHT_PX = 1200, 900
 SPEED_M_S = 10.0
+
+
+def seeds(count: int) -> pytest.MarkDecorator:
+    """Parametrises `seed` from 0 on; all but the first are slow."""
+    more = [pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, count)]
+    return pytest.mark.parametrize("seed", [0, *more])
 
 
 def values_of(names: Sequence[str], **values: float) -> FloatArray:

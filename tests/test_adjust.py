@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import pickle
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import forked
 import numpy as np
 import pytest
 from conftest import IMAGES, Site
@@ -26,7 +28,8 @@ from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, to_omega_phi_kappa
 from aeromatch_cli.lab.synthetic import load_truth
-from aeromatch_cli.sfm.mapping import Group, Observed, adjust_block
+from aeromatch_cli.sfm import process
+from aeromatch_cli.sfm.mapping import Group, Observed, adjust_block, map_block
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.strategies.exporters import Colmap, ExportContents
 
@@ -93,6 +96,18 @@ def test_disturbed_poses_are_adjusted_to_the_truth(truth: Truth) -> None:
     assert (figures[0].images, figures[0].points) == (6, len(adjusted.points_m))
 
 
+@pytest.mark.slow
+def test_a_mapper_makes_the_same_bytes_again(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two runs, of which the second is no copy of the first: `forked.kept_run` relies on it."""
+    observed = Observed(given_positions(truth, 100, 0.1), FOCAL_SIGMAS, {})
+    adjusted, _ = refined(truth)
+    mapped = map_block(disturbed(truth, 0), observed, "global")
+    monkeypatch.setattr(process, "subprocess", SimpleNamespace(run=forked.run))
+    again, _ = adjust_block(disturbed(truth, 0), observed, [Group("positions", IMAGE_IDS)], fixed=False)
+    mapped_again = map_block(disturbed(truth, 0), observed, "global")
+    assert [pickle.dumps(one) for one in (adjusted, *mapped)] == [pickle.dumps(one) for one in (again, *mapped_again)]
+
+
 def test_points_are_those_that_their_keypoints_see(truth: Truth) -> None:
     adjusted, _ = refined(truth)
     for image_id, track in adjusted.tracks.items():
@@ -103,6 +118,7 @@ def test_points_are_those_that_their_keypoints_see(truth: Truth) -> None:
         assert len(np.unique(track[:, 0])) == len(track) > 50
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_those_of_repeated_measurements(truth: Truth) -> None:
     """Eight blocks with other noise: root mean square errors, and the standard deviations that are stated."""
     runs = [refined(truth)[0], *(refined(truth, seed)[0] for seed in range(1, 8))]
@@ -126,6 +142,7 @@ def test_surveyed_poses_stay_and_get_points(truth: Truth) -> None:
     assert len(adjusted.points_m) >= 0.95 * truth.tied
 
 
+@pytest.mark.slow
 def test_an_image_outside_is_tied_by_its_points(truth: Truth) -> None:
     adjusted, figures = refined(truth, images=IMAGE_IDS[:5])
     assert figures[0].registered == ["img5"]
@@ -135,6 +152,7 @@ def test_an_image_outside_is_tied_by_its_points(truth: Truth) -> None:
     assert off_deg[5] < 0.5
 
 
+@pytest.mark.slow
 def test_groups_that_matches_tie_become_one(truth: Truth) -> None:
     """A first pass has put three images 40 m and 9 degrees beside the others; final matches tie them all."""
     contents = disturbed(truth, 0)
@@ -155,6 +173,7 @@ def test_groups_that_matches_tie_become_one(truth: Truth) -> None:
     assert off_deg.max() < 0.5
 
 
+@pytest.mark.slow
 def test_every_group_ties_its_images_outside(truth: Truth) -> None:
     """Two flights in one folder: each group lacks its last image, and finds it."""
     again = make_truth("second")
@@ -182,6 +201,7 @@ def test_every_group_ties_its_images_outside(truth: Truth) -> None:
         assert angle_between_deg(adjusted.poses[image_id].rotation, true.world_rotation) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("turned_deg", "used"), [(0.0, True), (180.0, False)])
 def test_tilts_given_with_wrong_headings_level_no_block(truth: Truth, turned_deg: float, used: bool) -> None:
     """Given attitudes that all lean 4 degrees over: they level the block, unless their headings are wrong as well."""
@@ -202,6 +222,7 @@ def test_tilts_given_with_wrong_headings_level_no_block(truth: Truth, turned_deg
     assert off_deg < (5.0 if used else 2.0)
 
 
+@pytest.mark.slow
 def test_two_groups_are_both_adjusted(truth: Truth) -> None:
     contents = disturbed(truth, 0)
     sides = {i: n % 3 == 2 for n, i in enumerate(IMAGE_IDS)}
@@ -215,6 +236,7 @@ def test_two_groups_are_both_adjusted(truth: Truth) -> None:
     assert set(seen.tolist()) == set(range(len(adjusted.points_m)))
 
 
+@pytest.mark.slow
 def test_a_group_whose_images_share_no_point_is_left_out(truth: Truth) -> None:
     contents, groups = disturbed(truth, 0), [Group("positions", IMAGE_IDS[:4]), Group("positions", IMAGE_IDS[4:])]
     within = [p for p in truth.pairs if {p.pair.image_id0, p.pair.image_id1} <= set(IMAGE_IDS[:4])]
@@ -224,6 +246,7 @@ def test_a_group_whose_images_share_no_point_is_left_out(truth: Truth) -> None:
     assert sorted(adjusted.poses) == list(IMAGE_IDS[:4])
 
 
+@pytest.mark.slow
 def test_groups_share_their_cameras(truth: Truth) -> None:
     """A second flight whose lens is another by 0.5 %: stated errors are those of the cameras that are handed over."""
     contents = disturbed(truth, 0)
@@ -260,6 +283,7 @@ def test_groups_share_their_cameras(truth: Truth) -> None:
         assert float(np.concatenate(off_px).mean()) == pytest.approx(figure.reprojection_error_px, rel=0.15)
 
 
+@pytest.mark.slow
 def test_positions_do_not_pull_a_group_in_a_frame_of_its_own(truth: Truth) -> None:
     """Given positions that are mirrored: of a group that is level they are no observations."""
     mirrored = {
@@ -273,6 +297,7 @@ def test_positions_do_not_pull_a_group_in_a_frame_of_its_own(truth: Truth) -> No
         np.testing.assert_allclose(pose.sigmas_m, free.poses[image_id].sigmas_m, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_no_image_is_in_two_groups(truth: Truth) -> None:
     """The matches tie all images: the second group stays by itself, the image in neither is tied to the first."""
     groups = [Group("positions", IMAGE_IDS[:2]), Group("positions", IMAGE_IDS[2:5])]
@@ -399,6 +424,7 @@ def test_an_image_without_texture_is_named(site: Site) -> None:
     assert f"not oriented: {site.names()[4]}: " in outcome.stdout
 
 
+@pytest.mark.slow
 def test_a_point_has_one_keypoint_in_each_image(truth: Truth) -> None:
     """img0 has every keypoint twice, 1.5 px apart, and is matched to others by the one or by the other."""
     contents = disturbed(truth, 4)

@@ -39,6 +39,7 @@ def test_what_is_expected_is_what_the_step_expects() -> None:
     assert found["expected"] == pytest.approx(pair.expected(LearnedFeatures(), 1000))
 
 
+@pytest.mark.slow
 def test_the_picture_is_the_same_each_time(tmp_path: Path) -> None:
     found = rows(*((n, 2 * n, 2 * n + 7) for n in range(20, 200)))
     for name in ("a.svg", "b.svg"):

@@ -55,7 +55,7 @@ def test_cameras_and_matches_are_spoilt_as_the_names_say(task: Task) -> None:
 
 @pytest.mark.slow
 def test_a_good_block_is_not_bad_and_a_spoilt_one_is_not_good() -> None:
-    task = Plan("grass", "cross", 16, "rtk2cm", 4, control=6).task(500)
+    task = Plan("grass", "cross", 12, "rtk2cm", 4, control=6).task(300)
     contents, groups = mapped(task.block)
     task = replace(task, contents=contents, groups=groups)
     evidence, errors = evidence_of(task)

@@ -116,13 +116,6 @@ def test_learned_descriptors_as_bytes_match_like_themselves():
     assert np.abs(of_floats.scores - of_bytes.scores).max() < 0.02
 
 
-@pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 5), (5, 0), (1, 1)])
-def test_few_descriptors_do_no_harm(count0, count1):
-    d = descriptors(np.random.default_rng(0), 5, 0)
-    matches = Bidirectional()(features(d[:count0]), features(d[:count1]), GEOMETRY)
-    assert matches.indices.shape == (min(count0, count1), 2)
-
-
 def test_matches_of_several_views_are_one_to_one():
     rng = np.random.default_rng(4)
     base = descriptors(rng, 40, 0)

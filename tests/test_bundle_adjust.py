@@ -12,6 +12,7 @@ from make_networks import (
     cross_strips,
     disturbed,
     lens,
+    seeds,
     simulated,
     strips,
     with_lens_prior,
@@ -26,7 +27,7 @@ from aeromatch_cli.sfm.bundle.projection import project
 from aeromatch_cli.sfm.bundle.shared import lenses_if_freed
 
 FINAL, ROUGH = Options(1e-6, final=True), Options(1e-4, final=False)
-SEEDS = pytest.mark.parametrize("seed", range(3))
+SEEDS = seeds(3)
 
 
 def block(seed: int, *, noise_px: float = 0.5, true_lens: FloatArray = PLAIN) -> tuple[Network, Unknowns]:
@@ -66,6 +67,7 @@ def test_positions_as_exact_as_stated_keep_their_weight(seed: int) -> None:
     assert found.network.located.all()
 
 
+@pytest.mark.slow
 def test_positions_stated_three_times_too_exact_are_found() -> None:
     """21 positions and what was stated, which counts as three more: 2.8 on average."""
     factors = []
@@ -81,6 +83,7 @@ def test_positions_stated_three_times_too_exact_are_found() -> None:
     assert ((np.array(factors) > 1.9) & (np.array(factors) < 3.9)).all()
 
 
+@pytest.mark.slow
 def test_positions_that_are_less_exact_in_height_alone_are_so_in_height_alone() -> None:
     factors = []
     for seed in range(6):

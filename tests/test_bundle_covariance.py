@@ -79,12 +79,14 @@ def compare(given: Network, truth: Unknowns) -> None:
         np.testing.assert_allclose(one[~free], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_with_positions_deviations_are_those_of_repeated_measurement() -> None:
     exact, truth = network()
     given = with_positions(exact, truth, np.random.default_rng(0), 0.1, noise_m=0.0)
     compare(given, truth)
 
 
+@pytest.mark.slow
 def test_with_calibration_deviations_are_those_of_repeated_measurement() -> None:
     exact, truth = network()
     given = with_positions(exact, truth, np.random.default_rng(0), 0.1, noise_m=0.0)
@@ -95,6 +97,7 @@ def test_with_calibration_deviations_are_those_of_repeated_measurement() -> None
     np.testing.assert_array_equal(found.lens_sigmas[0, [5, 8, 9, 10, 11]], 0.0)
 
 
+@pytest.mark.slow
 def test_with_control_points_alone_deviations_are_those_of_repeated_measurement() -> None:
     exact, truth = network()
     known = np.argsort(-np.bincount(exact.point))[[0, 5, 10, 15, 20, 25]]
@@ -102,6 +105,7 @@ def test_with_control_points_alone_deviations_are_those_of_repeated_measurement(
     compare(given, truth)
 
 
+@pytest.mark.slow
 def test_a_free_networks_deviations_are_those_of_repeated_measurement() -> None:
     """Errors count from where the true centres lie best: moved, turned and scaled."""
     given, truth = network()

@@ -13,6 +13,7 @@ from make_networks import (
     flight,
     lens,
     mount,
+    seeds,
     simulated,
     strips,
     values_of,
@@ -26,7 +27,7 @@ from aeromatch_cli.sfm.bundle.projection import project
 
 RTK_M = 0.02
 FINAL = Options(1e-6, final=True)
-SEEDS = pytest.mark.parametrize("seed", range(3))
+SEEDS = seeds(3)
 
 
 def flown(seed: int, *, noise_m: float = RTK_M, points: int = 150, **planted: Any) -> tuple[Network, Unknowns]:
@@ -48,7 +49,7 @@ def explained(found: Adjusted) -> set[str]:
     return {name for name, which in taken.items() if which.any()}
 
 
-@pytest.mark.parametrize("seed", range(10))
+@seeds(10)
 @pytest.mark.parametrize("noise_m", [RTK_M, 3 * RTK_M])
 def test_nothing_is_found_where_nothing_is_planted(seed: int, noise_m: float) -> None:
     """Positions as exact as stated, and three times less exact."""
@@ -106,6 +107,7 @@ def test_a_read_out_of_thirty_milliseconds_is_found(seed: int) -> None:
     assert found.sigma_px == pytest.approx(0.5, rel=0.1)
 
 
+@pytest.mark.slow
 @SEEDS
 def test_a_delay_and_a_read_out_are_found_together(seed: int) -> None:
     flights = np.array([flight(lag_s=0.2)] * 2)
@@ -134,6 +136,7 @@ def in_two_flights(seed: int, focal: float, centre_px: float) -> Adjusted:
     return adjusted(replace(network, xy_px=network.xy_px + moved_px * second[:, None]), truth, seed)
 
 
+@pytest.mark.slow
 @SEEDS
 def test_flights_of_one_lens_share_a_calibration(seed: int) -> None:
     [one] = in_two_flights(seed, 1.0, 0.0).flight_lenses
@@ -141,6 +144,7 @@ def test_flights_of_one_lens_share_a_calibration(seed: int) -> None:
     assert one.worth < 0.3
 
 
+@pytest.mark.slow
 @SEEDS
 def test_a_lens_that_was_focused_anew_is_another_one(seed: int) -> None:
     found = in_two_flights(seed, 1.01, 8.0)

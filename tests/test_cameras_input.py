@@ -234,6 +234,7 @@ def test_names_of_cameras_that_the_file_has_none_of_are_not_used(tmp_path: Path)
     assert any("none of the cameras that the pose list names (canon_5.2mm_40x30)" in w for w in inputs.warnings)
 
 
+@pytest.mark.slow
 def test_a_camera_file_of_a_hundred_thousand_brackets_is_refused(tmp_path: Path) -> None:
     (tmp_path / "deep.json").write_text('{"cameras":' + "[" * 100_000)
     with pytest.raises(ConfigError, match="nested too deeply"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from conftest import Site, invoke
 
 from aeromatch_cli.config import dump, load
@@ -32,6 +33,7 @@ def test_changed_settings_and_the_first_stage_that_reads_them_are_named(tmp_path
     assert changed_words(config, now) == ""
 
 
+@pytest.mark.slow
 def test_a_run_and_a_check_say_it_first_and_once(done_site: Site) -> None:
     given = ["baseline", *done_site.options()]
     assert "changed  " not in invoke("run", *given).stdout

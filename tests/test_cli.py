@@ -67,13 +67,6 @@ def test_version():
     assert (outcome.code, outcome.stdout.strip()) == (0, __version__)
 
 
-def test_importing_the_command_line_loads_nothing_heavy():
-    heavy = ("numpy", "cv2", "torch", "scipy", "yaml", "pydantic", "rasterio", "pycolmap", "matplotlib")
-    code = f"import sys, aeromatch_cli.cli; print([name for name in {heavy} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 @pytest.mark.slow
 def test_stage_by_stage_gives_what_run_gives(done_site):
     work = done_site.root / "stages"
@@ -112,6 +105,7 @@ def test_no_enhancement_writes_no_pictures(site):
     assert len(list(site.work.glob("simulated/*/*.png"))) == IMAGES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["simulate", "extract", "run"])
 def test_the_summary_tells_what_views_cost(site, command):
     stage = "simulate" if command == "simulate" else "extract"
@@ -138,6 +132,7 @@ def test_commands_that_need_an_earlier_one_say_so(site):
     assert site("export").code == 0
 
 
+@pytest.mark.slow
 def test_report_alone_shows_an_empty_block(site):
     assert site("report").code == 0
     assert "No pair is verified" in (site.work / "report" / "index.html").read_text()
@@ -310,6 +305,7 @@ def test_weights_commands(tmp_path, monkeypatch):
     assert "absent.pth" in outcome.stderr
 
 
+@pytest.mark.slow
 def test_settings_come_from_a_file_and_options_win(site):
     config = site.root / "my.yaml"
     config.write_text(

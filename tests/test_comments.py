@@ -289,6 +289,7 @@ def test_columns_of_control_points(tmp_path: Path, header: str, cells: str, posi
     np.testing.assert_allclose(point.position, position, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_comment_is_read_in_one_pass_whatever_its_length() -> None:
     long = "# " + "heights above the " * 20_000 + "z ( " * 20_000
     assert not statements_of([long]).units

@@ -292,6 +292,7 @@ def marked(task: Unreadable) -> bool:
     return task.mark.exists()
 
 
+@pytest.mark.slow
 def test_a_worker_without_memory_for_its_task_ends_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "b").touch()  # a worker reads this one
     with Executor("processes", 2) as executor:

@@ -84,6 +84,7 @@ def test_a_far_focal_length_goes_back_to_its_prior_with_the_ground_in_front_of_t
     assert np.abs(centers_of(found, image_numbers(found)) - CENTERS_M).max() < 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start_px", [FOCAL_PX, 230.0])
 def test_what_a_block_says_nothing_of_stays_near_its_prior(start_px: float) -> None:
     """All of the lens is free; a tenth of the prior's standard deviation is as far as noise may move the focal length,
@@ -98,6 +99,7 @@ def test_what_a_block_says_nothing_of_stays_near_its_prior(start_px: float) -> N
     assert np.abs(heights_m(found)).max() < 5.0
 
 
+@pytest.mark.slow
 def test_what_nobody_knows_of_a_focal_length_is_said() -> None:
     """With a prior ten times as wide, heights are as uncertain as it: 30 % of the flying height."""
     found = flat_block(noise_px=0.05)

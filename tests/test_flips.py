@@ -117,6 +117,7 @@ def test_level_ground_looks_nearly_the_same_from_the_other_pose(exact: pycolmap.
     np.testing.assert_allclose(back, pose.matrix(), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["positions", "some", "nothing"])
 @pytest.mark.parametrize("over", [(6,), (6, 7)])
 def test_images_that_are_turned_over_are_turned_back(
@@ -149,6 +150,7 @@ def test_an_image_without_points_is_left_alone(exact: pycolmap.Reconstruction) -
     assert _Other.of(pycolmap, model, 6) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("near", "seen", "relief_m"), [(5, 150, 2.0), (60, 40, 1.0), (100, 40, 2.0)])
 def test_an_image_whose_position_lies_on_the_other_side_stays(near: int, seen: int, relief_m: float) -> None:
     """What its own keypoints say counts, however many other images there are."""

@@ -361,6 +361,7 @@ def test_a_flipped_byte_in_any_array_leaves_no_fingerprint(tmp_path: Path, kind:
     assert not known(kind, path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["features", "matches", "verified"])
 def test_any_flipped_byte_leaves_no_fingerprint(tmp_path: Path, kind: str) -> None:
     """Also in the names, dates and lists of a zip archive, of which its members' checksums say nothing."""

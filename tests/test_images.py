@@ -367,6 +367,7 @@ def test_a_png_chunk_that_claims_more_than_the_file_holds_is_refused_at_once(tmp
         assert time.process_time() - before < 0.5  # OpenCV alone takes seconds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
 def test_jpeg_2000_that_is_cut_off_is_refused(tmp_path: Path, share: float) -> None:
     bands = np.random.default_rng(0).integers(0, 4096, (3, 600, 700)).astype(np.uint16)

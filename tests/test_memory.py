@@ -78,6 +78,7 @@ def test_check_counts_all_workers_and_reduced_images(site: Site) -> None:
     assert plain > 400.0 + 2 * 350.0
 
 
+@pytest.mark.slow
 def test_an_executor_keeps_to_its_limit() -> None:
     with Executor("processes", 3) as executor:
         assert len(executor.run(abs, [-1, -2, -3], "count")) == 3
@@ -87,6 +88,7 @@ def test_an_executor_keeps_to_its_limit() -> None:
         assert [outcome.value for outcome in executor.run(abs, [-1, -2], "count")] == [1, 2]
 
 
+@pytest.mark.slow
 def test_no_more_workers_than_tasks() -> None:
     """A thousand jobs for a few images would start as many processes."""
     with Executor("processes", 1000) as executor:

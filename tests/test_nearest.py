@@ -13,6 +13,7 @@ from aeromatch_cli.geometry.cameras import from_colmap
 from aeromatch_cli.strategies.matchers import MATCHERS
 from aeromatch_cli.strategies.matchers.descriptors import scan
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
+from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.matchers.descriptors.scan import Limits, mutual_nearest
 from aeromatch_cli.strategies.matchers.descriptors.search import comparable_views
@@ -144,10 +145,11 @@ def test_the_runner_up_is_another_keypoint():
     assert len(Nearest()(features(base), features(twins), GEOMETRY).indices) == 0
 
 
+@pytest.mark.parametrize("matcher", [Nearest(), Bidirectional()])
 @pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 5), (5, 0), (1, 1)])
-def test_few_descriptors_do_no_harm(count0, count1):
+def test_few_descriptors_do_no_harm(matcher, count0, count1):
     d = descriptors(np.random.default_rng(0), 5, 0)
-    matches = Nearest()(features(d[:count0]), features(d[:count1]), GEOMETRY)
+    matches = matcher(features(d[:count0]), features(d[:count1]), GEOMETRY)
     assert matches.indices.shape == (min(count0, count1), 2)
     assert matches.scores.shape == (min(count0, count1),)
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("suburb")
-    render_block(folder, "suburb", seed=12, width_px=480, height_px=360, images=6, flight="oblique")
+    render_block(folder, "suburb", seed=12, width_px=400, height_px=300, images=6, flight="oblique")
     return folder
 
 

@@ -189,6 +189,7 @@ def tilts_off(truth: dict[str, Pose], rotations: FloatArray) -> float:
     return max(np.rad2deg(np.arccos(np.clip(r[:, 2] @ p.world_rotation[:, 2], -1, 1))) for p, r in pairs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise_m", "limit_deg"), [(0.05, 0.9), (1.0, 1.5), (7.0, 6.0)])
 def test_positions_say_how_good_they_are_and_level_a_block_over_a_slope(noise_m: float, limit_deg: float) -> None:
     """Stated are 5 m. The median of ten blocks; level ground would be 10 degrees off."""

@@ -91,6 +91,7 @@ def test_another_networks_weights_are_refused(tmp_path: Path) -> None:
         load_orientation(tmp_path / "one.safetensors")
 
 
+@pytest.mark.slow
 def test_the_shipped_weights_find_turns_again(unseen: TurnedPairs) -> None:
     ours, gradients = table(degrees, unseen)["all"], table(gradient_peaks, unseen)["all"]
     # 7.0 degrees and 0.752; the histogram's are 5.5 and 0.745.

@@ -20,6 +20,7 @@ def test_the_file_is_up_to_date() -> None:
     assert json.loads(schema())["title"] == "aeromatch --json"
 
 
+@pytest.mark.slow
 def test_results_and_errors_fit_the_schema(site: Site) -> None:
     outcome, line = invoke("run", *site.options("--quiet", "--json")), any_outcome()
     found = line.validate_python(outcome.facts)

@@ -256,6 +256,7 @@ def test_missing_pair_list() -> None:
         PairFile(path="absent.txt")(block({"a": None}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilts_deg", [(0.0,), (0.0, 40.0, -40.0)], ids=["nadir", "oblique"])
 def test_screening_loses_no_pair_that_the_cap_keeps(tilts_deg: tuple[float, ...], monkeypatch: Any) -> None:
     rng = np.random.default_rng(4)

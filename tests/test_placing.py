@@ -52,6 +52,7 @@ def placed(seed: int, *, tilts: bool) -> Placement:
     return place(in_model(CENTERS_M), in_model(points_m), positions_m, np.full(3, STATED_M), ups)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilts", [False, True])
 def test_positions_along_a_line_do_not_tilt_a_strip(tilts: bool) -> None:
     """Of 40 strips: how far up is from true up, and the whole attitude from the true one, degrees."""
@@ -67,6 +68,7 @@ def test_positions_along_a_line_do_not_tilt_a_strip(tilts: bool) -> None:
     assert max(whole_deg) < 30.0
 
 
+@pytest.mark.slow
 def test_north_is_known_as_exactly_as_positions_tell_it() -> None:
     """Positions whose errors are those stated: root mean square of the headings' errors beside what is said of them."""
     errors, said = [], []

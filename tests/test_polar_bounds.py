@@ -42,6 +42,7 @@ def test_a_pair_of_vague_poses_is_registered() -> None:
     assert errors(found.matrix, truth, found.fit.middle_px / found.scale)[0] < 0.03
 
 
+@pytest.mark.slow
 def test_more_places_than_opencv_takes_in_one_picture_are_read() -> None:
     ramp = np.add.outer(10.0 * np.arange(50.0), np.arange(60.0)).astype(np.float32)
     rng = np.random.default_rng(1)
@@ -51,6 +52,7 @@ def test_more_places_than_opencv_takes_in_one_picture_are_read() -> None:
     assert np.abs(found - places @ [1.0, 10.0]).max() < 0.2  # OpenCV reads at multiples of a 32nd of a pixel
 
 
+@pytest.mark.slow
 def test_more_than_eleven_thousand_grid_points_are_searched_for() -> None:
     picture = np.random.default_rng(2).uniform(0.0, 255.0, (300, 400)).astype(np.float32)
     level = level_of(picture, None, 1.0, even=False)

@@ -39,6 +39,7 @@ def test_known_similarity_is_found_to_a_hundredth_of_a_pixel(turn_deg, scale, sh
     assert found.fit.gain == pytest.approx(1.0 / 0.8, abs=0.02)
 
 
+@pytest.mark.slow
 def test_covariance_says_how_exact_it_is():
     """Errors of many noises, in standard deviations: a few, for neighbours are alike and are taken for themselves."""
     source = ground(5)

@@ -127,6 +127,7 @@ def test_an_archive_with_a_name_twice_is_refused(tmp_path: Path) -> None:
         list_remote(str(tmp_path / "no.zip"))
 
 
+@pytest.mark.slow
 def test_a_run_of_an_archive_equals_that_of_a_folder(site: Site, archive: Path) -> None:
     flat = archive.with_name("flat.zip")
     with zipfile.ZipFile(flat, "w") as out:

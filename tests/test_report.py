@@ -185,19 +185,21 @@ def test_rows_hold_the_numbers_of_the_workspace(full):
     assert [(i.views, i.shadow) for i in images] == [(None, None)] * 4
 
 
+@pytest.mark.slow
 def test_several_processes_gather_the_same(full, monkeypatch):
     whole = gather(full, pair_table)
     assert set(whole.drawn) == {("a", "b"), ("a", "c"), ("b", "c")}
     monkeypatch.setattr(gathering, "_FEW_PAIRS", 1)
     with Executor("processes", 2) as executor:
-        parts = gather(replace(full, executor=executor), pair_table)
+        several = replace(full, executor=executor)
+        parts = gather(several, pair_table)
+        full.workspace.verified("b").write_bytes(b"damaged")
+        with pytest.raises(BrokenFileError, match=r"b\.npz"):
+            gather(several, pair_table)
     assert vars(parts).keys() == vars(whole).keys()
     for one, other in zip(whole.pairs + whole.images, parts.pairs + parts.images, strict=True):
         np.testing.assert_equal(vars(other), vars(one))
     assert parts.drawn == whole.drawn
-    full.workspace.verified("b").write_bytes(b"damaged")
-    with Executor("processes", 2) as executor, pytest.raises(BrokenFileError, match=r"b\.npz"):
-        gather(replace(full, executor=executor), pair_table)
 
 
 def test_images_tell_their_views_and_shadow(full):

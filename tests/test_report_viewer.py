@@ -155,6 +155,7 @@ def test_the_sketch_shows_the_ground_where_its_cameras_see_it(full: Context) -> 
     assert ground_sketch(full, {}, low, high) is None
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("size", ["small", "large"])
 def test_a_browser_draws_the_pair_that_the_address_names(

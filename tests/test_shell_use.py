@@ -77,6 +77,7 @@ def test_every_variable_of_the_guide_is_one() -> None:
     assert known == set(re.findall(r"AEROMATCH_[A-Z_]+", GUIDE))
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves_early_stops_nothing(shell: dict[str, str]) -> None:
     """`aeromatch list | head -1`, with the exit code of aeromatch itself."""
     command = "{ aeromatch list; echo $? >&2; } | head -1"

@@ -87,6 +87,7 @@ def test_the_budget_is_for_the_image_or_for_each_view():
     assert np.array_equal(*alone)
 
 
+@pytest.mark.slow
 def test_few_keypoints_of_a_large_view_are_those_of_a_reduced_one():
     gray, valid, keypoints = texture(1800, 1400), np.ones((1400, 1800), bool), 800
     valid[:, 1500:] = False
@@ -102,14 +103,16 @@ def test_few_keypoints_of_a_large_view_are_those_of_a_reduced_one():
     assert np.abs(np.median(offset, axis=0)).max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_view_is_not_reduced_where_it_would_have_too_few_keypoints():
-    dull = np.full((1600, 1600), 90, np.uint8)
+    dull = np.full((1300, 1300), 90, np.uint8)
     dull[:300, :300] = texture(300, 300)
     settings = {"keypoints": 1000, "pixels_per_keypoint": 300.0}
     assert factor_for(camera_of(dull), [source(dull)], 1000, 300.0) == 2
     assert len(extract(dull, **settings).descriptors) == len(extract(dull, keypoints=1000).descriptors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [{}, {"sigma": 2.4}, {"selection": "scale"}])
 def test_a_view_is_not_reduced_where_its_strongest_blobs_are_the_smallest(more):
     noise = np.random.default_rng(3).normal(0.0, 40.0, (1300, 1300)).astype(np.float32)
@@ -196,10 +199,10 @@ def test_tiles_share_out_every_pixel_once_and_are_bounded():
 
 @pytest.mark.slow
 def test_tiles_find_the_same_keypoints(monkeypatch):
-    gray = texture(1400, 900, seed=3)
+    gray = texture(800, 600, seed=3)
     whole = extract(gray, keypoints=10**6)
-    monkeypatch.setattr(detection, "TILE_AREA_PX", 400_000)
-    assert len(tiles(1400, 900, 400_000, 128)) > 3
+    monkeypatch.setattr(detection, "TILE_AREA_PX", 150_000)
+    assert len(tiles(800, 600, 150_000, 128)) > 3
     tiled = extract(gray, keypoints=10**6)
     a = {(round(float(x), 2), round(float(y), 2)) for x, y in whole.keypoints_px}
     b = {(round(float(x), 2), round(float(y), 2)) for x, y in tiled.keypoints_px}

@@ -216,6 +216,7 @@ def test_distant_ground_has_keypoints_of_its_own_as_many_for_each_pixel() -> Non
     assert 50 < found[0] < 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keypoints", [1, 2, 5, 40])
 def test_a_sliver_of_distant_ground_may_have_no_keypoint(keypoints: int) -> None:
     gray = np.random.default_rng(0).integers(0, 256, (PINHOLE.height_px, PINHOLE.width_px), dtype=np.uint8)
@@ -247,6 +248,7 @@ def test_views_of_distant_ground_are_bounded(
             assert (places < outline.max(axis=0) + 1.0).all()
 
 
+@pytest.mark.slow
 def test_distant_ground_does_not_tell_how_views_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Distant ground full of blobs beside near ground with fine ones: that goes back to full size all the same."""
     monkeypatch.setattr("aeromatch_cli.strategies.extractors.reduction._LEAST_PX", 1000)

@@ -79,6 +79,7 @@ def test_sixteen_bits_keep_what_eight_would_round_away(tmp_path, images):
     assert len(np.unique(values)) > 40
 
 
+@pytest.mark.slow
 def test_jpeg_2000_is_the_same_picture_whole_and_by_windows(tmp_path, images):
     stored = np.repeat(np.rint(PICTURE * 16.0)[None], 4, axis=0).astype(np.uint16)
     stored[3] = 4095 - stored[3]

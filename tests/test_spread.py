@@ -15,7 +15,7 @@ from aeromatch_cli.sfm.bundle.of_model import image_numbers, lens_of
 from aeromatch_cli.sfm.model_adjustment import Work, adjust_in_place
 from aeromatch_cli.sfm.thinning import chosen_points, take_poses, thinned
 
-POINTS, IMAGES = 6000, 6
+POINTS, IMAGES = 3000, 6
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +51,7 @@ def test_points_are_chosen_all_over_every_image(model: pycolmap.Reconstruction) 
         assert cells(model, image, [p for p in seen if p.point3D_id in kept]) == cells(model, image, seen)
 
 
+@pytest.mark.slow
 def test_poses_of_the_part_are_as_exact_as_those_of_all(model: pycolmap.Reconstruction) -> None:
     """Both adjusted from poses that are off: as near to the truth, and the model's own points stay."""
     truth = {i: model.images[i].projection_center() for i in image_numbers(model)}

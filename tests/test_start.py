@@ -52,6 +52,7 @@ def test_help_answers_in_half_a_second(arguments: list[str]) -> None:
     assert min(seconds) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "expected", "as_a_process"),
     [

@@ -50,6 +50,7 @@ def test_strict_is_for_commands_with_a_verdict(site: Site) -> None:
     assert site("pairs", "--strict").code == 2
 
 
+@pytest.mark.slow
 def test_run_show_and_page_agree(done_site: Site) -> None:
     told = site_quality(done_site)
     assert told["verdict"] in ("good", "doubtful")

@@ -78,8 +78,12 @@ def dump(settings: Settings) -> str:
 
     Its `workspace` is therefore `.`: the file runs again where it lies, even after the folder was moved.
     """
-    tree = settings.model_dump(mode="json") | {"workspace": "."}
-    return yaml.safe_dump(tree, sort_keys=False, width=100, allow_unicode=True)
+    return yaml.safe_dump(plain(settings), sort_keys=False, width=100, allow_unicode=True)
+
+
+def plain(settings: Settings) -> dict[str, Any]:
+    """Return the tree that `dump` writes, as reading it gives it back."""
+    return settings.model_dump(mode="json") | {"workspace": "."}
 
 
 def parse_method(text: str) -> tuple[str, list[str]]:

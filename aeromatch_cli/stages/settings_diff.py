@@ -7,10 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from aeromatch_cli import graph
-from aeromatch_cli.config import Settings, differing, dump, load
+from aeromatch_cli.config import Settings, differing, load, plain
 from aeromatch_cli.errors import ConfigError
 
 # Most settings that are named.
@@ -21,12 +19,12 @@ def changed_words(config: Path, settings: Settings) -> str:
     """Return the settings that differ from those in `config`, the workspace's own, and from where on results that
     depend on them are made again; "" where there are none, or no sound file."""
     try:
-        before = yaml.safe_load(dump(load(str(config))))
+        before = plain(load(str(config)))
     except ConfigError:
         return ""
     changed = [
         (key, old, new)
-        for key, new, old in differing(yaml.safe_load(dump(settings)), before)
+        for key, new, old in differing(plain(settings), before)
         if graph.first_reader(key) and _resolved(old) != _resolved(new)
     ]
     if not changed:
