@@ -1,4 +1,4 @@
-"""Models of a first pass take in images, and smaller models, that points of two images tie to them."""
+"""Models of a first pass take in images that points of two images tie to them."""
 
 from __future__ import annotations
 
@@ -42,14 +42,6 @@ def same(model: Model) -> bool:
         and np.linalg.norm(model.centers_m[i] - TRUTH[i].center_m) < 1.0
         for i in model.rotations
     )
-
-
-def test_a_smaller_model_in_another_frame_becomes_part_of_the_larger_one() -> None:
-    pairs, _ = matches(TRUTH)
-    (found,) = found_of([model_of(turned(STRIP)), model_of(REST)], pairs)
-    assert found.rotations.keys() == TRUTH.keys()
-    assert found.figures.images == len(TRUTH)
-    assert same(found)
 
 
 def test_images_of_no_model_are_resected() -> None:

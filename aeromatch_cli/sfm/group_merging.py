@@ -9,17 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, IntArray
-from aeromatch_cli.sfm.georeferencing import similarity
 
 # Points of two groups are the same place up to this share of the distance from which the images see them.
 _SAME_SHARE = 0.02
 # Groups are joined by so many such points, and where so large a share of the matched points agrees.
 _FEWEST, _LEAST_SHARE = 30, 0.4
-_SAMPLES = 500
 
 Similarity = tuple[float, FloatArray, FloatArray]
 
@@ -105,22 +104,14 @@ def common_similarity(source: FloatArray, goal: FloatArray, tolerance: float) ->
 
     tolerance: largest distance of an agreeing point, in the goal's unit.
     """
+    import pycolmap
+
     if len(source) < _FEWEST:
         return None
-    rng = np.random.default_rng(0)
-    best = np.zeros(len(source), dtype=bool)
-    for _ in range(_SAMPLES):
-        rows = rng.choice(len(source), size=4, replace=False)
-        agree = _agree(similarity(source[rows], goal[rows]), source, goal, tolerance)
-        best = agree if agree.sum() > best.sum() else best
-    for _ in range(5):
-        if best.sum() < max(_FEWEST, _LEAST_SHARE * len(source)):
-            return None
-        fit = similarity(source[best], goal[best])
-        best = _agree(fit, source, goal, tolerance)
-    return fit if best.sum() >= max(_FEWEST, _LEAST_SHARE * len(source)) else None
-
-
-def _agree(fit: Similarity, source: FloatArray, goal: FloatArray, tolerance: float) -> FloatArray:
-    scale, rotation, shift = fit
-    return np.asarray(np.linalg.norm(scale * source @ rotation.T + shift - goal, axis=1) <= tolerance)
+    options = pycolmap.RANSACOptions(max_error=tolerance, min_inlier_ratio=_LEAST_SHARE, random_seed=0)
+    found: Any = pycolmap.estimate_sim3d_robust(source, goal, options)
+    if found is None or found["num_inliers"] < max(_FEWEST, _LEAST_SHARE * len(source)):
+        return None
+    inliers = found["inlier_mask"]
+    fit = pycolmap.estimate_sim3d(source[inliers], goal[inliers])  # the one found may come from few of them
+    return None if fit is None else (float(fit.scale), fit.rotation.matrix(), fit.translation)

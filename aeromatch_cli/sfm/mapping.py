@@ -19,8 +19,6 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, ControlPoint, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.geometry.cameras import colmap_params, focal_px
-from aeromatch_cli.geometry.lenses import in_colmap
 from aeromatch_cli.results.adjustment import GroupResult, PlacementKind
 from aeromatch_cli.results.stages import MappedModel
 from aeromatch_cli.sfm.bundle.network import LENS
@@ -204,8 +202,7 @@ def _task(contents: ExportContents, observed: Observed) -> Iterator[Path]:
 
 
 def _camera_task(block: Block, camera_id: str, observed: Observed) -> dict[str, Any]:
-    """Return what a process needs to know of a camera: its prior, which unknowns are free, and what mapping starts
-    from."""
+    """Return what a process needs to know of a camera: its prior, and which unknowns are free."""
     stated = observed.cameras.get(camera_id, block.cameras[camera_id])
     prior = lens_prior(stated, observed.focal_sigmas[camera_id])
     images = sum(image.camera_id == camera_id for image in block.images)
@@ -215,9 +212,6 @@ def _camera_task(block: Block, camera_id: str, observed: Observed) -> dict[str, 
         "sigmas": freed(prior, observed.calibration, observed.switches, images).tolist(),
         "held_sigmas": [sigma * (name in held) for name, sigma in zip(LENS, prior.sigmas.tolist(), strict=True)],
         "fisheye": prior.fisheye,
-        "params": colmap_params(in_colmap(block.cameras[camera_id]).camera or block.cameras[camera_id]),
-        "focal_px": focal_px(stated),
-        "sigma": observed.focal_sigmas[camera_id],
     }
 
 

@@ -25,7 +25,6 @@ from aeromatch_cli.sfm.model_adjustment import (
     Work,
     adjusted,
     believed_tilts,
-    drop_far_images,
     drop_weak_images,
     images_by_camera,
     reset_lenses,
@@ -38,9 +37,6 @@ from aeromatch_cli.sfm.process import ANY_DISTORTION, quiet_pycolmap
 # Mapping starts again with the focal lengths that it found until none changes by more than this share.
 _FOCAL_CHANGE = 0.1
 _MAX_STARTS = 3
-# A focal length that is so many of its prior's standard deviations away has to be better than the prior: by more points
-# or smaller errors than these shares leave.
-_FAR_SIGMAS, _AS_MANY, _AS_EXACT = 4.0, 0.8, 1.2
 _MIN_IMAGES = 3
 # Positions are found from the longest tracks, so many in every image that has them, in large blocks fewer: 300 images
 # take 13 s with 100, 36 s with 300. Small blocks need them: lewis 0.5 degrees with 100, 0.1 with 300. Points after that
@@ -64,8 +60,6 @@ def solve(folder: Path) -> None:
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
     priors = np.load(folder / "priors.npz")
     models = _mapped(pycolmap, folder, task["mapper"])
-    if _far_from_priors(models, task["cameras"]):
-        models = _with_priors(pycolmap, folder, task, models)
     work = Work.of_task(pycolmap, task["cameras"], Options(_COST_TOLERANCE, final=False))
     given = Given.of_file(priors)
     facts = []
@@ -73,7 +67,6 @@ def solve(folder: Path) -> None:
         work.lenses.clear()
         work.start(model)
         reset_lenses(work, model)
-        drop_far_images(model)
         drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
@@ -104,7 +97,8 @@ def _mapped(pycolmap: ModuleType, folder: Path, mapper: str) -> list[Any]:
     """Models, the largest first, from focal lengths that mapping itself confirms.
 
     A wrong focal length bends the relative rotations that mapping starts from; the bundle adjustment at its end finds
-    the right one all the same. Mapping starts again with it, until it finds what it started from.
+    the right one all the same. Mapping starts again with it, until it finds what it started from. Blocks that need it:
+    rendered suburbs, flight `mixed`, seeds 943 and 5101, 7 images.
     """
     models: list[Any] = []
     database = folder / "database.db"
@@ -113,7 +107,8 @@ def _mapped(pycolmap: ModuleType, folder: Path, mapper: str) -> list[Any]:
     for start in range(_MAX_STARTS):
         out = folder / f"start{start}"
         out.mkdir(exist_ok=True)
-        models = _once(pycolmap, database, out, mapper, free=True)
+        run = _global if mapper == "global" else _incremental
+        models = _largest_first(run(pycolmap, database, out))
         if not models or not _update_focal_lengths(pycolmap, database, models):
             break
     return models
@@ -124,7 +119,7 @@ def _calibrate_large_block(pycolmap: ModuleType, database: Path, out: Path) -> N
     with pycolmap.Database.open(database) as opened:
         if opened.num_images() <= LARGE_BLOCK:
             return
-    options = _global_options(pycolmap, database, free=True)
+    options = _global_options(pycolmap, database)
     options.mapper.track_required_tracks_per_view = _ROUGH_TRACKS
     options.mapper.ba_skip_fixed_rotation_stage = True
     options.mapper.ba_num_iterations = 1
@@ -133,43 +128,8 @@ def _calibrate_large_block(pycolmap: ModuleType, database: Path, out: Path) -> N
     _update_focal_lengths(pycolmap, database, _largest_first(models))
 
 
-def _once(pycolmap: ModuleType, database: Path, out: Path, mapper: str, *, free: bool) -> list[Any]:
-    """Models, the largest first. free: whether focal lengths and distortions are unknowns."""
-    run = _global if mapper == "global" else _incremental
-    return _largest_first(run(pycolmap, database, out, free))
-
-
 def _largest_first(models: dict[int, Any]) -> list[Any]:
     return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-
-
-def _far_from_priors(models: list[Any], priors: dict[str, Any]) -> bool:
-    """Whether the largest model has found a focal length that its prior speaks against."""
-    for number, prior in priors.items():
-        if models and _sees(models[0], int(number)):
-            ratio = models[0].cameras[int(number)].mean_focal_length() / prior["focal_px"]
-            if abs(ratio - 1.0) > max(_FOCAL_CHANGE, _FAR_SIGMAS * prior["sigma"]):
-                return True
-    return False
-
-
-def _with_priors(pycolmap: ModuleType, folder: Path, task: dict[str, Any], free: list[Any]) -> list[Any]:
-    """Models mapped with the prior focal lengths held, where they are as good as the `free` ones, else these.
-
-    Straight views of flat ground go with any focal length and some flying height: what free mapping finds is chance.
-    """
-    database, out = folder / "database.db", folder / "held"
-    out.mkdir(exist_ok=True)
-    with pycolmap.Database.open(database) as opened:
-        for camera in opened.read_all_cameras():
-            camera.params = task["cameras"][str(camera.camera_id)]["params"]
-            opened.update_camera(camera)
-    held = _once(pycolmap, database, out, task["mapper"], free=False)
-    if not held or held[0].num_reg_images() < free[0].num_reg_images():
-        return free
-    fewer = held[0].num_points3D() < _AS_MANY * free[0].num_points3D()
-    worse = held[0].compute_mean_reprojection_error() > _AS_EXACT * free[0].compute_mean_reprojection_error()
-    return free if fewer or worse else held
 
 
 def _update_focal_lengths(pycolmap: ModuleType, database: Path, models: list[Any]) -> bool:
@@ -190,13 +150,13 @@ def _sees(model: Any, camera_id: int) -> bool:
     return any(image.has_pose and image.camera_id == camera_id for image in model.images.values())
 
 
-def _global(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict[int, Any]:
-    options = _global_options(pycolmap, database, free)
+def _global(pycolmap: ModuleType, database: Path, out: Path) -> dict[int, Any]:
+    options = _global_options(pycolmap, database)
     found: dict[int, Any] = pycolmap.global_mapping(database, out, out, options)
     return found
 
 
-def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
+def _global_options(pycolmap: ModuleType, database: Path) -> Any:
     with pycolmap.Database.open(database) as opened:
         tracks = max(_LEAST_TRACKS, min(_TRACKS_PER_IMAGE, _TRACKS // max(1, opened.num_images())))
         most = max(Counter(image.camera_id for image in opened.read_all_images()).values(), default=0)
@@ -207,9 +167,8 @@ def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
     options.mapper.track_required_tracks_per_view = tracks
     options.mapper.skip_retriangulation = True
     options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = _COST_TOLERANCE
-    options.mapper.bundle_adjustment.refine_focal_length = free
-    options.mapper.bundle_adjustment.refine_extra_params = (
-        free and most >= _DISTORTION_IMAGES and not _divided(pycolmap, database)
+    options.mapper.bundle_adjustment.refine_extra_params = most >= _DISTORTION_IMAGES and not _divided(
+        pycolmap, database
     )
     return options
 
@@ -220,13 +179,12 @@ def _divided(pycolmap: ModuleType, database: Path) -> bool:
         return any(camera.model.name == "FULL_OPENCV" for camera in opened.read_all_cameras())
 
 
-def _incremental(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict[int, Any]:
+def _incremental(pycolmap: ModuleType, database: Path, out: Path) -> dict[int, Any]:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed, options.num_threads = 0, 1
     options.min_model_size = _MIN_IMAGES
     options.extract_colors = False
-    options.ba_refine_focal_length = free
-    options.ba_refine_extra_params = free and not _divided(pycolmap, database)
+    options.ba_refine_extra_params = not _divided(pycolmap, database)
     options.max_extra_param = options.mapper.max_extra_param = options.triangulation.max_extra_param = ANY_DISTORTION
     found: dict[int, Any] = pycolmap.incremental_mapping(database, out, out, options=options)
     return found

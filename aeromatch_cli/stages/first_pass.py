@@ -60,7 +60,10 @@ def fitted(recipe: FirstPass, block: Block) -> FirstPass:
 
 
 def look(recipe: FirstPass, block: Block) -> FirstPass:
-    """Return the cheaper first pass by which given poses are judged before they are found anew."""
+    """Return the cheaper first pass by which given poses are judged before they are found anew.
+
+    Rendered farmland, flight `cross`, 16 images with right poses: 8 seconds instead of 13.
+    """
     longest_px = max(max(image.width_px, image.height_px) for image in block.images)
     size_px = max(_LOOK_LEAST_PX, min(_LOOK_SIZE_PX, round(_LOOK_SHARE * longest_px)))
     return recipe.model_copy(
@@ -74,7 +77,7 @@ def look(recipe: FirstPass, block: Block) -> FirstPass:
 
 def thorough(recipe: FirstPass, first: Context) -> FirstPass | None:
     """Return the dearer first pass of a block in parts; None where it would take too long. first: the one that was
-    run."""
+    run. A block that needs it: that of tests/test_judged_block.py, with 120 keypoints 3 of 5 images without it."""
     if max(len(first.pairs), count_pairs(first, recipe)) > _MOST_DEAR_PAIRS:
         return None
     return recipe.model_copy(update={"keypoints": _MORE_KEYPOINTS * recipe.keypoints})

@@ -44,7 +44,7 @@ from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 
 # The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
-VERSION, _LARGE_BLOCK_VERSION = 24, 1
+VERSION, _LARGE_BLOCK_VERSION = 25, 1
 # What was found, of what, and which pairs the first pass has verified.
 _DATA = "orientation/orientation.json"
 # What failures.csv calls the mapper's process.
