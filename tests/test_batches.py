@@ -25,7 +25,7 @@ from aeromatch_cli.nets import lightglue_batch
 from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.stages import batches, match
 from aeromatch_cli.stages.batches import matched_in_batches
-from aeromatch_cli.stages.rows import PairTask
+from aeromatch_cli.stages.driver import PairTask
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.matchers.lightglue import inference

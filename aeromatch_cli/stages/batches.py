@@ -10,7 +10,7 @@ from typing import Any
 
 from aeromatch_cli.data import Features, Matches
 from aeromatch_cli.executor import guarded
-from aeromatch_cli.stages.rows import PairTask
+from aeromatch_cli.stages.driver import PairTask
 from aeromatch_cli.strategies import BatchedMatcher, Matcher
 
 log = logging.getLogger(__name__)

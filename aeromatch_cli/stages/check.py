@@ -19,11 +19,11 @@ from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, MIN_MATCHES, P
 from aeromatch_cli.stages import cascade, extract, first_pass, simulate
 from aeromatch_cli.stages.block import with_gsd
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.driver import PairTask
 from aeromatch_cli.stages.filter import candidates, pair_seed
 from aeromatch_cli.stages.match import compared
 from aeromatch_cli.stages.memory import command_mb, runs_network
 from aeromatch_cli.stages.models import thresholds_px
-from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import Filter

@@ -19,7 +19,8 @@ from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.results.stages import EnhanceResult
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.stages.driver import run_images
+from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import PIPELINE_VERSION, library_version
 from aeromatch_cli.store.block_store import BlockStore
 from aeromatch_cli.strategies import Enhanced, Enhancer
@@ -170,20 +171,17 @@ def run(context: Context) -> StageReport:
     """Write enhanced/<id>.png for every image of the shard that is not up to date; none for images left as taken."""
     report = StageReport("enhance")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [
-        task for task in tasks if not task.as_taken and (context.scope.overwrite or not is_done(context.store, task))
-    ]
-    report.items, report.skipped = len(tasks), len(tasks) - len(todo)
-    for task in tasks:
-        if task.as_taken:
-            _remove(task, (".png", ".mask.png", ".json"))
-    run_stage(context, report, _run_task, todo, [task.image_id for task in todo])
+    as_taken = [task for task in tasks if task.as_taken]
+    for task in as_taken:
+        _remove(task, (".png", ".mask.png", ".json"))
+    report.items = report.skipped = len(as_taken)
+    others = [task for task in tasks if not task.as_taken]
+    run_images(context, report, _run_task, others, lambda task: is_done(context.store, task))
     nothing = f"enhance={context.settings.enhance.name} changes nothing: no pictures"
     report.result = EnhanceResult(
         images_skipped_same_illumination=skipped_images(tasks),
         remark="" if context.settings.enhance.changes else nothing,
     )
-    report.fingerprint = fingerprint([task.fingerprint for task in tasks])
     return report.write(context.workspace, context.scope.shard)
 
 

@@ -13,8 +13,9 @@ from aeromatch_cli.results.stages import Exported, ExportResult
 from aeromatch_cli.stages.consistency import final_block, final_pairs
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.driver import run_stage
 from aeromatch_cli.stages.inputs import inputs_fingerprint
-from aeromatch_cli.stages.stage_report import StageReport, forget, run_stage, unexplained, whole_record
+from aeromatch_cli.stages.stage_report import StageReport, forget, unexplained, whole_record
 from aeromatch_cli.strategies import Strategy
 
 log = logging.getLogger("aeromatch")

@@ -17,7 +17,8 @@ from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.results.stages import ExtractResult, StageResult
 from aeromatch_cli.stages import enhance, simulate
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.stages.driver import run_images
+from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.store.block_store import BlockStore, KnownFeatures
 from aeromatch_cli.strategies import Extractor
 
@@ -102,17 +103,13 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     report = before or StageReport("extract")
     chosen = [image.image_id for image in context.images()] if image_ids is None else sorted(set(image_ids))
     tasks = [task_of(context, image_id) for image_id in chosen]
-    todo = [task for task in tasks if context.scope.overwrite or not _is_done(context.store, task)]
-    report.items += len(tasks)
-    report.skipped += len(tasks) - len(todo)
-    network = any(task.extractor.network for task in todo)
-    made = run_stage(context, report, run_task, todo, [task.image_id for task in todo], network=network)
+    network = context.settings.extract.network
+    made = run_images(context, report, run_task, tasks, lambda task: _is_done(context.store, task), network=network)
     for one in made:
         context.store.made_features(one.image_id, one.features)
     context.index.flush()
     if made:
         report.result = _result(made, tasks, report.result)
-    report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
     return report.write(context.workspace, context.scope.shard)
 
 

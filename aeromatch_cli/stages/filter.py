@@ -25,9 +25,9 @@ from aeromatch_cli.formats.rows import (
 from aeromatch_cli.geometry.components import labels_by_name
 from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import FilterResult
-from aeromatch_cli.stages import extract, match, rows
+from aeromatch_cli.stages import driver, extract, match
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.rows import PairTask, RowResult, run_rows
+from aeromatch_cli.stages.driver import PairTask, RowResult, run_rows
 from aeromatch_cli.stages.stage_report import StageReport, unexplained
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.store.block_store import KnownVerdict, stale_image, verdicts_of
@@ -109,9 +109,9 @@ def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
 def run_task(task: FilterTask) -> RowResult[KnownVerdict]:
     """Judge what is not up to date in one row."""
     path = task.workspace.verified(task.image_id0)
-    old = rows.readable(read_verified_row, path, task.overwrite)
+    old = driver.readable(read_verified_row, path, task.overwrite)
     matched = read_match_row(task.workspace.matches(task.image_id0))
-    row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _judge(task, pair, matched[pair.image_id1]))
+    row = driver.redo(task.image_id0, task.pairs, old, lambda pair: _judge(task, pair, matched[pair.image_id1]))
     write_atomically(path, lambda stream: write_verified_row(stream, row.entries))
     found = sum(len(entry.matches.indices) for entry in row.made)
     return RowResult(task.image_id0, len(row.made), found, row.failures, verdicts_of(row.entries))

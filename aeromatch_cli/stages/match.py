@@ -16,11 +16,11 @@ from aeromatch_cli.images.source import Source
 from aeromatch_cli.images.stored import StoredRaster
 from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import MatchResult
-from aeromatch_cli.stages import extract, rows
+from aeromatch_cli.stages import driver, extract
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.driver import PairTask, RowResult, run_rows
 from aeromatch_cli.stages.enhance import check_unchanged
-from aeromatch_cli.stages.rows import PairTask, RowResult, run_rows
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.store.block_store import KnownMatches, matches_of
@@ -106,13 +106,15 @@ def _features_wanted(context: Context, pair: Pair) -> tuple[str, str]:
 def run_task(task: MatchTask) -> RowResult[KnownMatches]:
     """Match what is not up to date in one row."""
     path = task.workspace.matches(task.image_id0)
-    old = rows.readable(read_match_row, path, task.overwrite)
+    old = driver.readable(read_match_row, path, task.overwrite)
     features0 = _features(task.workspace.features(task.image_id0))
-    ahead = matched_in_batches(task.matchers, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
+    ahead = matched_in_batches(
+        task.matchers, driver.missing(task.pairs, old), lambda pair: _sides(task, pair, features0)
+    )
     maker = task.workspace.features_of
     own = maker == task.workspace.step
     scanned = None if own else read_match_row(task.workspace.of_step(maker, maker).matches(task.image_id0))
-    row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead, scanned))
+    row = driver.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead, scanned))
     write_atomically(path, lambda stream: write_match_row(stream, row.entries))
     found = sum(len(entry.matches.indices) for entry in row.made)
     return RowResult(task.image_id0, len(row.made), found, row.failures, matches_of(row.entries))

@@ -25,6 +25,7 @@ from aeromatch_cli.results.stages import RefineResult
 from aeromatch_cli.sfm.spanning_trees import Trees, shifts_through, trees_of
 from aeromatch_cli.stages.contents import with_current_pairs
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.driver import run_stage
 from aeromatch_cli.stages.enhance import source_of
 from aeromatch_cli.stages.filter import verified_pairs
 from aeromatch_cli.stages.inputs import inputs_fingerprint
@@ -39,7 +40,7 @@ from aeromatch_cli.stages.measuring import (
     measurement_fingerprint,
     patches_of,
 )
-from aeromatch_cli.stages.stage_report import StageReport, forget, run_stage, whole_record
+from aeromatch_cli.stages.stage_report import StageReport, forget, whole_record
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.refiners.least_squares import LeastSquares
 

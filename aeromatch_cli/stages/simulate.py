@@ -19,7 +19,8 @@ from aeromatch_cli.images.views import render_view
 from aeromatch_cli.results.stages import ViewsResult
 from aeromatch_cli.stages import enhance
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.stages.driver import run_images
+from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.store.block_store import BlockStore
 from aeromatch_cli.strategies import Simulator, ViewPixels
 from aeromatch_cli.strategies.simulators import source_view
@@ -47,6 +48,10 @@ class SimulateTask:
     simulator: Simulator
     fingerprint: str
     remark: str = ""
+
+    @property
+    def image_id(self) -> str:
+        return self.enhance.image_id
 
 
 def make_task(context: Context, image: Image) -> SimulateTask:
@@ -181,12 +186,9 @@ def run(context: Context) -> StageReport:
     """Write simulated/<id>/ for every image of the shard that is not up to date."""
     report = StageReport("simulate")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [task for task in tasks if context.scope.overwrite or not is_done(context.store, task)]
-    report.items, report.skipped = len(tasks), len(tasks) - len(todo)
-    costs = run_stage(context, report, _run_task, todo, [task.enhance.image_id for task in todo])
+    costs = run_images(context, report, _run_task, tasks, lambda task: is_done(context.store, task))
     if costs:
         report.result = views_result(costs)
-    report.fingerprint = fingerprint([task.fingerprint for task in tasks])
     return report.write(context.workspace, context.scope.shard)
 
 

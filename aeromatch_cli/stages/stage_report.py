@@ -1,18 +1,17 @@
-"""This module keeps what a stage leaves behind: its report, the list of all failures, and how its tasks are run."""
+"""This module keeps what a stage leaves behind: its report, and the list of all failures."""
 
 from __future__ import annotations
 
 import logging
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 from aeromatch_cli import graph
 from aeromatch_cli.data import Pair
-from aeromatch_cli.executor import Outcome
 from aeromatch_cli.files import read_json, translated_os_errors, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.results.stages import StageResult
@@ -21,8 +20,6 @@ from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.store.naming import item_named, names_on_file
 from aeromatch_cli.workspace import Workspace
 
-T = TypeVar("T")
-V = TypeVar("V")
 R = TypeVar("R", bound=StageResult)
 
 log = logging.getLogger("aeromatch")
@@ -213,29 +210,3 @@ def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[t
     remedy = "run `aeromatch run`, or the single stages match and filter in this order"
     text = f"missing, or made with other settings, attitudes or inputs: {remedy}"
     return [(image_id, f"results of {command} for {count} pair(s): {text}") for image_id, count in rows.items()]
-
-
-def run_stage(
-    context: Context,
-    report: StageReport,
-    function: Callable[[T], V],
-    tasks: Sequence[T],
-    names: Sequence[str],
-    sizes: Sequence[int] | None = None,
-    *,
-    network: bool = False,
-) -> list[V]:
-    """Run tasks, put failures into the report under their names, return the values of the rest.
-
-    sizes: how many items each task counts while it is shown how far the stage is. network: whether tasks run one.
-    """
-    label = context.scope.part + report.stage
-    outcomes: list[Outcome[V]] = context.executor.run(function, tasks, label, sizes, network=network) if tasks else []
-    values = []
-    for name, outcome in zip(names, outcomes, strict=True):
-        if outcome.value is None:
-            report.failures.append((name, outcome.error))
-        else:
-            values.append(outcome.value)
-    report.done += len(values)
-    return values

@@ -31,8 +31,8 @@ from aeromatch_cli.results.stages import ExtractResult, MatchResult
 from aeromatch_cli.stages import cascade, extract, match
 from aeromatch_cli.stages.cascade import StepContext
 from aeromatch_cli.stages.context import Context, Union
-from aeromatch_cli.stages.rows import PairTask, RowResult, run_rows
-from aeromatch_cli.stages.stage_report import StageReport, gather_failures, result_on_file, run_stage
+from aeromatch_cli.stages.driver import PairTask, RowResult, run_rows, run_stage
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures, result_on_file
 from aeromatch_cli.store.block_store import KnownFeatures, KnownMatches, matches_of
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.workspace import Workspace

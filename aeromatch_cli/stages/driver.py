@@ -1,4 +1,7 @@
-"""Rows: all pairs of one image in one file, redone pair by pair. What match and filter share."""
+"""The driver of stages whose items are images or pairs: what is not up to date is made, the rest is counted.
+
+All pairs of one image are a row: one task and one file, in which single pairs are made again.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,23 @@ from typing import Generic, Protocol, TypeVar
 
 from aeromatch_cli.data import PairGeometry
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.executor import guarded
+from aeromatch_cli.executor import Outcome, guarded
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.stages.stage_report import StageReport
+
+S = TypeVar("S")
+V = TypeVar("V")
+
+
+class ImageTask(Protocol):
+    """Asks for what a stage makes of one image, which must carry the fingerprint."""
+
+    @property
+    def image_id(self) -> str: ...
+
+    @property
+    def fingerprint(self) -> str: ...
 
 
 class Entry(Protocol):
@@ -56,6 +73,7 @@ class Known(Protocol):
     def fingerprint(self) -> str: ...
 
 
+I = TypeVar("I", bound=ImageTask)  # noqa: E741
 K = TypeVar("K", bound=Known)
 T = TypeVar("T", bound=RowTask)
 
@@ -114,6 +132,27 @@ def readable(read: Callable[[Path], dict[str, E]], path: Path, overwrite: bool) 
         return {}
 
 
+def run_images(
+    context: Context,
+    report: StageReport,
+    work: Callable[[I], V],
+    tasks: Sequence[I],
+    is_done: Callable[[I], bool],
+    *,
+    network: bool = False,
+) -> list[V]:
+    """Make what is not up to date of a stage's images, and count them in the report; return what was made.
+
+    work: makes what belongs to an image. is_done: whether that is on file as the task would make it. network: whether
+    the tasks run one.
+    """
+    todo = [task for task in tasks if context.scope.overwrite or not is_done(task)]
+    report.items += len(tasks)
+    report.skipped += len(tasks) - len(todo)
+    report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
+    return run_stage(context, report, work, todo, [task.image_id for task in todo], network=network)
+
+
 def run_rows(
     context: Context,
     report: StageReport,
@@ -146,3 +185,29 @@ def run_rows(
     context.index.flush()
     report.done = sum(result.done for result in results)
     return results
+
+
+def run_stage(
+    context: Context,
+    report: StageReport,
+    function: Callable[[S], V],
+    tasks: Sequence[S],
+    names: Sequence[str],
+    sizes: Sequence[int] | None = None,
+    *,
+    network: bool = False,
+) -> list[V]:
+    """Run tasks, put failures into the report under their names, return the values of the rest.
+
+    sizes: how many items each task counts while it is shown how far the stage is. network: whether tasks run one.
+    """
+    label = context.scope.part + report.stage
+    outcomes: list[Outcome[V]] = context.executor.run(function, tasks, label, sizes, network=network) if tasks else []
+    values = []
+    for name, outcome in zip(names, outcomes, strict=True):
+        if outcome.value is None:
+            report.failures.append((name, outcome.error))
+        else:
+            values.append(outcome.value)
+    report.done += len(values)
+    return values
