@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -202,6 +202,13 @@ class Workspace:
 
     def stage_report(self, stage: str, shard: str = "") -> Path:
         return self.reports / (f"{stage}.{shard}.json" if shard else f"{stage}.json")
+
+    def forget(self, stage: str, paths: Iterable[Path] = ()) -> None:
+        """Remove what a stage of the whole block has left: first its report, so that where the command is stopped
+        nothing vouches for what is then made of something else."""
+        for path in (self.stage_report(stage), *paths):
+            with translated_os_errors(path):
+                path.unlink(missing_ok=True)
 
     def create(self) -> None:
         """Make the folder and prove that it can be written; refuse one of another format version, or with links that

@@ -40,3 +40,10 @@ def work(task: Task) -> int:
 def slow_square(number: int) -> int:
     time.sleep(0.2)
     return number * number
+
+
+def worker_name(number: int) -> str:
+    """Of the dask worker that runs the task."""
+    from distributed import get_worker
+
+    return str(get_worker().name)

@@ -28,7 +28,8 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import output, scores, totals
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.results import stages as results
-from aeromatch_cli.stages.context import Scope
+from aeromatch_cli.store.block_store import BlockStore
+from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace
 
 PAGE = text_of(ROOT / "docs" / "extending.md")
@@ -139,11 +140,12 @@ def test_the_stage_writes_its_table_where_it_is_not_up_to_date(
         (pair, SimpleNamespace(matches=SimpleNamespace(indices=range(n))))
         for pair, n in zip(pairs, (7, 0), strict=True)
     ]
-    context = SimpleNamespace(workspace=Workspace(tmp_path), pairs=pairs, scope=Scope())
-    module.with_current_pairs = lambda context: (context, [])
+    store = BlockStore(Workspace(tmp_path), Index())
+    context = SimpleNamespace(workspace=store.workspace, pairs=pairs, store=store, recorded=store.report)
+    state = SimpleNamespace(with_current_pairs=lambda: (context, []), inputs=lambda _: "some verdicts")
+    module.BlockState = SimpleNamespace(of=lambda _: state)
     declared = graph.Stage("connections", "block", module.ConnectionsResult)
     monkeypatch.setattr(graph, "BY_NAME", {**graph.BY_NAME, "connections": declared})
-    module.inputs_fingerprint = lambda *_: "some verdicts"
     module.final_pairs = lambda _: entries
     first, second = module.run(context), module.run(context)
     assert ((first.done, first.skipped), (second.done, second.skipped)) == ((1, 0), (0, 1))
@@ -151,7 +153,7 @@ def test_the_stage_writes_its_table_where_it_is_not_up_to_date(
     assert (tmp_path / "connections.csv").read_text(encoding="utf-8").splitlines()[1:] == ["a,b,7"]
     (tmp_path / "connections.csv").unlink()
     assert module.run(context).done == 1
-    module.inputs_fingerprint = lambda *_: "other verdicts"
+    state.inputs = lambda _: "other verdicts"
     assert module.run(context).done == 1
 
 

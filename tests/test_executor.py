@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from conftest import heed_interrupts
 from dask_cluster import Processes, dask_cluster, dask_worker
-from make_slow import Task, slow_square, work
+from make_slow import Task, slow_square, work, worker_name
 
 from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.cli.progress import TerminalProgress
@@ -243,12 +243,6 @@ def test_a_killed_dask_worker_loses_no_task(cluster: tuple[str, Processes]) -> N
 def names(executor: Executor) -> set[str]:
     """Of the dask workers that have come."""
     return {str(worker["name"]) for worker in executor._client.scheduler_info()["workers"].values()}
-
-
-def worker_name(number: int) -> str:
-    from distributed import get_worker
-
-    return str(get_worker().name)
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ from conftest import Site
 
 from aeromatch_cli.config import load
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.stages.match import matcher_of, pair_fingerprint
 from aeromatch_cli.stages.pairs import prepare
+from aeromatch_cli.stages.state import BlockState
 
 pytestmark = pytest.mark.slow
 
@@ -26,8 +26,8 @@ def test_only_pairs_of_images_outside_are_guided(done_site: Site, matcher: str) 
     assert 0 < len(untied) < len(context.pairs)
     for pair in context.pairs:
         changed = pair in untied
-        assert matcher_of(grown, pair).guided is changed
-        assert (pair_fingerprint(grown, pair) != pair_fingerprint(context, pair)) is changed
+        assert BlockState.of(grown).matcher(pair).guided is changed
+        assert (BlockState.of(grown).matches(pair) != BlockState.of(context).matches(pair)) is changed
 
 
 def test_a_matcher_without_guided_search_stays(done_site: Site) -> None:
@@ -35,4 +35,4 @@ def test_a_matcher_without_guided_search_stays(done_site: Site) -> None:
     context, *_ = prepare(settings, Executor("serial"))
     everywhere = frozenset(image.image_id for image in context.block.images)
     grown = replace(context, block=replace(context.block, outside=everywhere))
-    assert matcher_of(grown, context.pairs[0]) is settings.match
+    assert BlockState.of(grown).matcher(context.pairs[0]) is settings.match

@@ -23,10 +23,10 @@ from aeromatch_cli.sfm.block_figures import block_figures, residual_figures, res
 from aeromatch_cli.sfm.calibration import held_by
 from aeromatch_cli.sfm.mapping import Group, adjust_block
 from aeromatch_cli.stages import orient
-from aeromatch_cli.stages.contents import contents_of, with_current_pairs
+from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.inputs import inputs_fingerprint
-from aeromatch_cli.stages.stage_report import StageReport, forget
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.stages.surveyed import control_of_block, control_remarks, counted_from_below, height_remarks
 from aeromatch_cli.stages.unregistered import unregistered_reasons
 from aeromatch_cli.stages.versions import library_version
@@ -46,7 +46,7 @@ def run(context: Context) -> StageReport:
         report.result = AdjustResult(images=0, remarks=[] if first_pass is None else [_NOTHING])
         _remove(context)
         return report.write(context.workspace)
-    context, _ = with_current_pairs(context)
+    context, _ = BlockState.of(context).with_current_pairs()
     report.fingerprint = _fingerprint(context)
     if report.is_up_to_date(context):
         return report.write(context.workspace)
@@ -79,7 +79,7 @@ def is_current(context: Context) -> bool:
     False."""
     groups = _groups(context)
     try:
-        return bool(groups) and _is_current(with_current_pairs(context)[0], groups)
+        return bool(groups) and _is_current(BlockState.of(context).with_current_pairs()[0], groups)
     except InputError:  # no pair has results
         return False
 
@@ -105,13 +105,13 @@ def _fingerprint(context: Context) -> str:
         for part in (observed.focal_sigmas, observed.cameras, observed.angles, observed.flights, observed.velocities)
     ]
     how = VERSION, library_version("pycolmap"), context.settings.orient, context.settings.adjust.model_dump()
-    return fingerprint(how, inputs_fingerprint(context, "adjust"), sorted(poses.items()), known, control)
+    return fingerprint(how, BlockState.of(context).inputs("adjust"), sorted(poses.items()), known, control)
 
 
 def _remove(context: Context) -> None:
     folder = context.workspace.orientation
     names = ("adjusted.npz", "orientation.csv", "residuals.csv", context.workspace.final.name)
-    forget(context, "adjust", [folder / name for name in names])
+    context.workspace.forget("adjust", [folder / name for name in names])
 
 
 def _residuals(context: Context, adjusted: AdjustedBlock) -> dict[str, PoseResidual]:

@@ -25,6 +25,7 @@ from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.pair_statistics import PairStatistics
 from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
 from aeromatch_cli.strategies.extractors.described import Described
@@ -236,7 +237,7 @@ def _step(context: Context, name: str, features_of: str, settings: Settings, rea
 
 def evidence_of(steps: Sequence[StepContext]) -> dict[Key, PairStatistics]:
     """Return, by pair, what the steps have found together, for the pairs that the last of their steps has judged."""
-    judged = [_InOrder(filter.verified_pairs(step.context)) for step in steps]
+    judged = [_InOrder(BlockState.of(step.context).verified_pairs()) for step in steps]
     readers = [_keypoint_reader(step) for step in steps]
     found = {}
     for pair in steps[0].context.pairs:

@@ -20,10 +20,11 @@ from aeromatch_cli.stages import cascade, extract, first_pass, simulate
 from aeromatch_cli.stages.block import with_gsd
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.driver import PairTask
-from aeromatch_cli.stages.filter import candidates, pair_seed
+from aeromatch_cli.stages.filter import candidates
 from aeromatch_cli.stages.match import compared
 from aeromatch_cli.stages.memory import command_mb, runs_network
 from aeromatch_cli.stages.models import thresholds_px
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import Filter
@@ -299,7 +300,7 @@ def _time_pairs(context: Context, sampled: Sequence[Pair], timed: Mapping[str, _
         found = [timed[i].features for i in (pair.image_id0, pair.image_id1) if i in timed]
         features0, features1 = found if len(found) == 2 else (None, None)
         if features0 is not None and features1 is not None:
-            task = PairTask(context.geometry(pair), "", ("", ""), pair_seed(context, pair))
+            task = PairTask(context.geometry(pair), "", ("", ""), BlockState.of(context).seed(pair))
             settings = context.settings
             shown = None
             if settings.match.reads_pixels:

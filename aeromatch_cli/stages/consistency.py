@@ -21,11 +21,11 @@ from aeromatch_cli.sfm.outlier_rejection import Limits, MatchedKeypoints, contra
 from aeromatch_cli.sfm.track_pruning import without_dropped
 from aeromatch_cli.sfm.two_view_poses import placed_alone
 from aeromatch_cli.stages import adjust, orient
-from aeromatch_cli.stages.contents import contents_of, with_current_pairs
+from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import Judged, connection, verified_pairs
-from aeromatch_cli.stages.inputs import inputs_fingerprint
-from aeromatch_cli.stages.stage_report import StageReport, forget
+from aeromatch_cli.stages.filter import connection
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.state import BlockState, Judged
 from aeromatch_cli.store.matches import FinalEntries
 
 VERSION = 7
@@ -37,25 +37,31 @@ def run(context: Context) -> StageReport:
     recipe = context.settings.rejection
     adjusted = None
     if recipe is not None and orient.groups(context):
-        context, _ = with_current_pairs(context)
+        context, _ = BlockState.of(context).with_current_pairs()
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None and _judges_pairs(context):
-        context, _ = with_current_pairs(context)
+        context, _ = BlockState.of(context).with_current_pairs()
         adjusted = AdjustedBlock.empty()
     if adjusted is None or recipe is None:
         words = f"not done: match {context.settings.match.name} measures points without keypoints"
         report.result = ConsistencyResult(remark=words if context.settings.match.reads_pixels else "")
-        forget(context, "consistency", [path, context.workspace.final])
+        context.workspace.forget("consistency", [path, context.workspace.final])
         return report.write(context.workspace)
     report.items = len(context.pairs)
-    report.fingerprint = fingerprint(VERSION, recipe, inputs_fingerprint(context, "consistency"), bool(adjusted.poses))
+    report.fingerprint = fingerprint(
+        VERSION, recipe, BlockState.of(context).inputs("consistency"), bool(adjusted.poses)
+    )
     if report.is_up_to_date(context):
         return report.write(context.workspace)
-    forget(context, "consistency", [context.workspace.final])
+    context.workspace.forget("consistency", [context.workspace.final])
     with context.executor.step("consistency"):
         cameras = adjusted.cameras_of(context.block)
-        entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
+        entries = [
+            (pair, entry)
+            for pair, entry in BlockState.of(context).verified_pairs()
+            if entry.verdict.state == "verified"
+        ]
         keypoints_px = contents_of(context, adjusted).keypoints_px
         pairs = [_matched(context, adjusted, keypoints_px, pair.image_id0, entry) for pair, entry in entries]
         limits = Limits(
@@ -177,5 +183,5 @@ def final_pairs(context: Context, features: Callable[[str], str] | None = None) 
     """Return judged pairs in the order of pairs.csv, without the matches that contradict the adjusted block. features:
     as `verified_pairs` has them."""
     final = FinalEntries(context.workspace)
-    for pair, entry in verified_pairs(context, features):
+    for pair, entry in BlockState.of(context).verified_pairs(features):
         yield pair, final.left(pair.image_id0, entry)  # of present keypoints: stale ones are none of those pairs

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from aeromatch_cli.blocks.crs import LOCAL, geographic_from_grid
-from aeromatch_cli.data import AdjustedBlock, FloatArray, Pair
-from aeromatch_cli.errors import BrokenFileError, InputError, ItemError
+from aeromatch_cli.data import AdjustedBlock, FloatArray
+from aeromatch_cli.errors import BrokenFileError, ItemError
 from aeromatch_cli.formats.adjusted import read_residuals
 from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
@@ -18,7 +17,7 @@ from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.sfm.shutter import at_once
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import Judged, outdated_pairs, verified_pairs
+from aeromatch_cli.stages.state import BlockState, Judged
 from aeromatch_cli.stages.tracks import MatchedPair, Tracks, tracks_of
 from aeromatch_cli.strategies.exporters import ExportContents, PairContents
 from aeromatch_cli.strategies.exporters.contents import Colours
@@ -28,26 +27,10 @@ log = logging.getLogger("aeromatch")
 _Verified = Callable[[Context], Judged]
 
 
-def with_current_pairs(context: Context) -> tuple[Context, list[Pair]]:
-    """Return the context with the pairs whose results are up to date, and the other pairs. InputError where none is
-    left."""
-    outdated = outdated_pairs(context)
-    if not outdated and context.pairs:
-        return context, outdated
-    absent = {(pair.image_id0, pair.image_id1) for pair in outdated}
-    pairs = [p for p in context.pairs if (p.image_id0, p.image_id1) not in absent]
-    if not pairs:
-        raise InputError(
-            "no pair is matched and filtered with the present settings and inputs; "
-            "run `aeromatch match` and then `aeromatch filter` (`aeromatch run` does everything), and see failures.csv"
-        )
-    return replace(context, pairs=tuple(pairs)), outdated
-
-
 def contents_of(
     context: Context,
     adjusted: AdjustedBlock | None = None,
-    verified: _Verified = verified_pairs,
+    verified: _Verified = lambda context: BlockState.of(context).verified_pairs(),
     *,
     raw: bool = True,
 ) -> ExportContents:

@@ -129,6 +129,10 @@ class Context:
         """Return what the workspace holds."""
         return BlockStore(self.workspace, self.index)
 
+    def recorded(self, stage: str) -> dict[str, Any]:
+        """Return the report of a stage of the whole block as `BlockStore.report`; nothing where all is made anew."""
+        return {} if self.scope.overwrite else self.store.report(stage)
+
     @property
     def observed(self) -> Observed:
         """Return what was given, as observations for mapping and adjustment."""

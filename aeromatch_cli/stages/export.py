@@ -11,11 +11,11 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.results.stages import Exported, ExportResult
 from aeromatch_cli.stages.consistency import final_block, final_pairs
-from aeromatch_cli.stages.contents import contents_of, with_current_pairs
+from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.driver import run_stage
-from aeromatch_cli.stages.inputs import inputs_fingerprint
-from aeromatch_cli.stages.stage_report import StageReport, forget, unexplained, whole_record
+from aeromatch_cli.stages.stage_report import StageReport, unexplained
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies import Strategy
 
 log = logging.getLogger("aeromatch")
@@ -34,13 +34,13 @@ class ExportTask:
 def run(context: Context) -> StageReport:
     """Write export/<name>/ for every exporter whose folder is not up to date."""
     report = StageReport("export")
-    context, outdated = with_current_pairs(context)
+    context, outdated = BlockState.of(context).with_current_pairs()
     adjusted = final_block(context)
     given = sorted(context.given.block.poses.items()), sorted(context.guessed_cameras)
-    wanted = fingerprint(context.settings.export, inputs_fingerprint(context, "export"), given, adjusted is None)
+    wanted = fingerprint(context.settings.export, BlockState.of(context).inputs("export"), given, adjusted is None)
     report.items, report.fingerprint = len(context.settings.export), wanted
     folders = [context.workspace.export(exporter.name) for exporter in context.settings.export]
-    record = whole_record(context, "export")
+    record = context.recorded("export")
     before = ExportResult.of_json(record.get("result"))
     # None has failed where all have a result; of pairs that are missing the report may tell failures all the same.
     if record.get("fingerprint") == wanted and before and before.exporters.keys() == {path.name for path in folders}:
@@ -49,7 +49,7 @@ def run(context: Context) -> StageReport:
         report.skipped, report.result, report.files = report.items, before, record["files"]
         report.failures = unexplained(context, outdated, "filter")
         return report.write(context.workspace)
-    forget(context, "export")
+    context.workspace.forget("export")
     tasks = [ExportTask(e, context, f, adjusted) for e, f in zip(context.settings.export, folders, strict=True)]
     names = [exporter.name for exporter in context.settings.export]
     # In this process, one after the other: a task holds the whole context.

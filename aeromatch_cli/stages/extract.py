@@ -141,16 +141,3 @@ def _is_done(store: BlockStore, task: ExtractTask) -> bool:
     if task.keep_images:
         return enhance.is_done(store, source) and simulate.is_done(store, task.views)
     return enhance.is_kept(store, source) and simulate.is_kept(store, task.views)
-
-
-def current(context: Context, image_ids: Iterable[str]) -> set[str]:
-    """Return those of the images whose features on file are the ones that the present settings and inputs give."""
-    store = context.store
-    return {i for i in set(image_ids) if (known := store.features(i)) and known.fingerprint == wanted(context, i)}
-
-
-def wanted(context: Context, image_id: str) -> str:
-    """Return the fingerprint that the features of an image must carry."""
-    if context.scope.union is not None:
-        return context.scope.union.features.get(image_id, "")
-    return task_of(context, image_id).fingerprint

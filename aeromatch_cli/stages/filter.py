@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import Candidates, FloatArray, Matches, Pair
 from aeromatch_cli.files import read_json, write_atomically
-from aeromatch_cli.fingerprints import canonical, combined, fingerprint, stable_hash
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import (
     MatchEntry,
@@ -25,22 +24,19 @@ from aeromatch_cli.formats.rows import (
 from aeromatch_cli.geometry.components import labels_by_name
 from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import FilterResult
-from aeromatch_cli.stages import driver, extract, match
+from aeromatch_cli.stages import driver
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.driver import PairTask, RowResult, run_rows
 from aeromatch_cli.stages.stage_report import StageReport, unexplained
-from aeromatch_cli.stages.versions import library_version
-from aeromatch_cli.store.block_store import KnownVerdict, stale_image, verdicts_of
+from aeromatch_cli.stages.state import BlockState
+from aeromatch_cli.store.block_store import KnownVerdict, verdicts_of
 from aeromatch_cli.store.matches import match_points, select
 from aeromatch_cli.strategies.filters import apply_chain
-from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
 from aeromatch_cli.strategies.filters.chain import Filter
 from aeromatch_cli.workspace import Workspace
 
 # Keypoints (K, 2) of an image, stored pixels, and their colours (K, 3) where the extractor kept them.
 Side = tuple[FloatArray, NDArray[np.uint8] | None]
-# Pairs and their verdicts, in the order of pairs.csv.
-Judged = Iterator[tuple[Pair, VerifiedEntry]]
 # An image with fewer verified matches than this over all its pairs is called weakly tied.
 WEAK_MATCHES = 50
 
@@ -56,48 +52,22 @@ class FilterTask:
     overwrite: bool
 
 
-def pair_seed(context: Context, pair: Pair) -> int:
-    """Return the random seed of a pair, which is the same whatever else is in the block."""
-    return stable_hash(f"{context.settings.seed} {pair.image_id0} {pair.image_id1}") % (1 << 31)
-
-
-def pair_fingerprint(context: Context, pair: Pair) -> str:
-    """Return the fingerprint that the verdict on a pair must carry: of the chain, the matches, the geometry that the
-    chain reads, and the seed."""
-    return context.once("filter", *pair.ids, make=lambda: _pair_fingerprint(context, pair))
-
-
-def _pair_fingerprint(context: Context, pair: Pair) -> str:
-    how, needs = context.once("filter", make=lambda: _how(context))
-    sides = [context.geometry_fingerprint(i, needs) for i in pair.ids]
-    own = match.pair_fingerprint(context, pair), sides, pair_seed(context, pair)
-    return combined(*how, *map(canonical, own))
-
-
-def _how(context: Context) -> tuple[tuple[str, ...], frozenset[str]]:
-    """Return what the verdicts on all pairs depend on, as canonical text, and what the chain needs of the geometry."""
-    chain = context.settings.filter
-    needs = frozenset[str]().union(*(strategy.needs for strategy in chain))
-    return (canonical(CHAIN_VERSION), canonical(chain), canonical(library_version("poselib"))), needs
-
-
 def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
     """Return one task per row of the shard, and the pairs whose matches or features are not up to date: those have
     none.
 
     Larger rows first, so that none runs last.
     """
-    rows = context.rows()
-    features = extract.current(context, {i for r in rows.values() for p in r for i in (p.image_id0, p.image_id1)})
+    rows, state = context.rows(), BlockState.of(context)
+    features = state.with_features(image_id for row in rows.values() for pair in row for image_id in pair.ids)
     tasks, missing = [], []
     for image_id0, pairs in rows.items():
         matched, row = context.store.matches(image_id0), []
         for pair in pairs:
-            known = {pair.image_id0, pair.image_id1} <= features
             on_file = matched.get(pair.image_id1)
-            if known and on_file and on_file.fingerprint == match.pair_fingerprint(context, pair):
-                own = pair_fingerprint(context, pair)
-                row.append(PairTask(context.geometry(pair), own, on_file.features, pair_seed(context, pair)))
+            if on_file and on_file.fingerprint == state.matches(pair) and features.issuperset(pair.ids):
+                made_of, seed = state.verdict(pair), state.seed(pair)
+                row.append(PairTask(context.geometry(pair), made_of, on_file.features, seed))
             else:
                 missing.append(pair)
         tasks.append(
@@ -165,44 +135,6 @@ def _result_on_file(context: Context, report: StageReport) -> FilterResult | Non
     return FilterResult.of_json(found.get("result")) if same else None
 
 
-def outdated_pairs(context: Context) -> list[Pair]:
-    """Return pairs whose verdict, or the features that it points into, is not what present settings and inputs give."""
-    features = extract.current(context, {i for p in context.pairs for i in (p.image_id0, p.image_id1)})
-    outdated = []
-    for image_id0, pairs in context.rows().items():
-        judged = context.store.verdicts(image_id0)
-        for pair in pairs:
-            known, verdict = {pair.image_id0, pair.image_id1} <= features, judged.get(pair.image_id1)
-            if not known or verdict is None or verdict.fingerprint != pair_fingerprint(context, pair):
-                outdated.append(pair)
-    return outdated
-
-
-def known_verdicts(context: Context) -> Iterator[tuple[Pair, KnownVerdict]]:
-    """Yield what is known of judged pairs, as `verified_pairs` has them, without their matches."""
-    row_id, row = "", dict[str, KnownVerdict]()
-    features = cache(context.store.features_fingerprint)
-    for pair in context.pairs:
-        if pair.image_id0 != row_id:
-            row_id, row = pair.image_id0, context.store.verdicts(pair.image_id0)
-        known = row.get(pair.image_id1)
-        if known is not None and not stale_image((pair.image_id0, pair.image_id1), known.features, features):
-            yield pair, known
-
-
-def verified_pairs(context: Context, features: Callable[[str], str] | None = None) -> Judged:
-    """Return judged pairs in the order of pairs.csv: stale rows, of older pair lists or features that were made again
-    since, cannot leak. features: fingerprint of an image's features, "" of none; by default that on file."""
-    row_id, row = "", dict[str, VerifiedEntry]()
-    features = features or cache(context.store.features_fingerprint)
-    for pair in context.pairs:
-        if pair.image_id0 != row_id:
-            row_id, row = pair.image_id0, read_verified_row(context.workspace.verified(pair.image_id0))
-        entry = row.get(pair.image_id1)
-        if entry is not None and not stale_image((pair.image_id0, pair.image_id1), entry.features, features):
-            yield pair, entry
-
-
 def connection(context: Context, judged: Iterable[tuple[str, str, str, int]] | None = None) -> FilterResult:
     """States of the pairs, verified matches, sizes of the groups of images that verified pairs connect, and images
     that are weakly tied or not at all.
@@ -211,7 +143,8 @@ def connection(context: Context, judged: Iterable[tuple[str, str, str, int]] | N
     """
     if judged is None:
         judged = (
-            (pair.image_id0, pair.image_id1, known.state, known.matches) for pair, known in known_verdicts(context)
+            (pair.image_id0, pair.image_id1, known.state, known.matches)
+            for pair, known in BlockState.of(context).known_verdicts()
         )
     states: Counter[str] = Counter()
     ties: Counter[str] = Counter()

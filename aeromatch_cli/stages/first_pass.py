@@ -18,6 +18,7 @@ from aeromatch_cli.sfm.mapping_process import LARGE_BLOCK
 from aeromatch_cli.sfm.retrieval import similar_pairs
 from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies.enhancers.none import NoEnhancement
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.filters.poselib import Poselib
@@ -174,7 +175,7 @@ def count_pairs(context: Context, recipe: FirstPass) -> int:
 def verified_points(context: Context) -> Iterator[PairPoints]:
     """Yield verified matches of the first pass, stored pixels."""
     keypoints = {}
-    for pair, entry in filter.verified_pairs(context):
+    for pair, entry in BlockState.of(context).verified_pairs():
         if entry.verdict.state != "verified":
             continue
         for image_id in (pair.image_id0, pair.image_id1):

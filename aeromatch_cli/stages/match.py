@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
+from aeromatch_cli.data import Features, Matches, PairGeometry
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import write_atomically
-from aeromatch_cli.fingerprints import canonical, combined, fingerprint
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row, write_match_row
 from aeromatch_cli.images.source import Source
@@ -22,7 +22,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.driver import PairTask, RowResult, run_rows
 from aeromatch_cli.stages.enhance import check_unchanged
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.stages.versions import library_version
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.store.block_store import KnownMatches, matches_of
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.matchers.descriptors.search import Search
@@ -42,34 +42,6 @@ class MatchTask:
     sources: Mapping[str, Source] = field(default_factory=dict)
 
 
-def matcher_of(context: Context, pair: Pair) -> Matcher:
-    """Return the matcher of a pair: guided for an image that the first pass could not tie to the others."""
-    chosen: Matcher = context.settings.match
-    untied = context.block.outside & {pair.image_id0, pair.image_id1}
-    return chosen.model_copy(update={"guided": True}) if untied and isinstance(chosen, Search) else chosen
-
-
-def pair_fingerprint(context: Context, pair: Pair) -> str:
-    """Return the fingerprint that the matches of a pair must carry: of the matcher, both images' features, and their
-    geometry."""
-    if context.scope.union is not None:
-        return context.scope.union.matches.get((pair.image_id0, pair.image_id1), "")
-    return context.once("match", *pair.ids, make=lambda: _pair_fingerprint(context, pair))
-
-
-def _pair_fingerprint(context: Context, pair: Pair) -> str:
-    matcher, ids = matcher_of(context, pair), pair.ids
-    overlap = str(pair.overlap) if matcher.reads_pixels else ""  # where it is small, poses are not doubted
-    how = context.once("match", matcher is context.settings.match, make=lambda: _how(context, matcher))
-    sides = [(extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads())) for i in ids]
-    return combined(*how, canonical(sides), canonical(overlap))
-
-
-def _how(context: Context, matcher: Matcher) -> tuple[str, ...]:
-    """Return what the matches of all pairs of one matcher depend on, as canonical text."""
-    return canonical(matcher), canonical(context.scope.searched_by), canonical(library_version("poselib"))
-
-
 def paired_images(context: Context) -> set[str]:
     """Return every image whose features the rows of this shard need."""
     return {i for pairs in context.rows().values() for p in pairs for i in (p.image_id0, p.image_id1)}
@@ -83,24 +55,21 @@ def images_of_rows(context: Context) -> set[str]:
 def make_tasks(context: Context) -> list[MatchTask]:
     """Return one task per row of the shard, pairs without features left out. Larger rows first, so that none runs
     last."""
-    features = extract.current(context, images_of_rows(context))
-    tasks = []
+    state = BlockState.of(context)
+    features, tasks = state.with_features(images_of_rows(context)), []
     for image_id0, pairs in context.rows().items():
         usable = [p for p in pairs if p.image_id0 in features and p.image_id1 in features]
         row = tuple(
-            PairTask(context.geometry(p), pair_fingerprint(context, p), _features_wanted(context, p)) for p in usable
+            PairTask(context.geometry(p), state.matches(p), (state.features(p.image_id0), state.features(p.image_id1)))
+            for p in usable
         )
         if row:
             ids = (image_id0, *(pair.image_id1 for pair in row)) if context.settings.match.reads_pixels else ()
             sources = {image_id: extract.task_of(context, image_id).views.enhance.source for image_id in ids}
-            matchers = {pair.image_id1: matcher_of(context, pair) for pair in usable}
+            matchers = {pair.image_id1: state.matcher(pair) for pair in usable}
             task = MatchTask(image_id0, row, matchers, context.workspace, context.scope.overwrite, sources)
             tasks.append(task)
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
-
-
-def _features_wanted(context: Context, pair: Pair) -> tuple[str, str]:
-    return extract.wanted(context, pair.image_id0), extract.wanted(context, pair.image_id1)
 
 
 def run_task(task: MatchTask) -> RowResult[KnownMatches]:

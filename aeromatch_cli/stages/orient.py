@@ -38,7 +38,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
 from aeromatch_cli.stages.messages import frame_remarks
 from aeromatch_cli.stages.models import best_mapped, evidence_of
-from aeromatch_cli.stages.stage_report import StageReport, forget, gather_failures, whole_record
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.swapped_axes import exchanged_columns
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
@@ -236,7 +236,7 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
 
 def _on_file(context: Context) -> Mapping[str, Any]:
     """What an earlier run has found and of what, where its files are as they were written; else nothing."""
-    report = whole_record(context, "orient")
+    report = context.recorded("orient")
     if _DATA not in report.get("files", {}):
         return {}
     return {**read_json(context.workspace.root / _DATA), "fingerprint": report["fingerprint"]}
@@ -246,7 +246,7 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
     """Write what was found; return the contents of orientation.json, which begins with `head`."""
     workspace = context.workspace
     folder = workspace.orientation
-    forget(context, "orient")
+    context.workspace.forget("orient")
     write_text(folder / "cameras.csv", cameras_text(solution.cameras))
     write_text(folder / "poses.csv", poses_text(solution.poses))
     names = []

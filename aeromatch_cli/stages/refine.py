@@ -23,12 +23,9 @@ from aeromatch_cli.formats.features import read_keypoints, write_refined
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.results.stages import RefineResult
 from aeromatch_cli.sfm.spanning_trees import Trees, shifts_through, trees_of
-from aeromatch_cli.stages.contents import with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.driver import run_stage
 from aeromatch_cli.stages.enhance import source_of
-from aeromatch_cli.stages.filter import verified_pairs
-from aeromatch_cli.stages.inputs import inputs_fingerprint
 from aeromatch_cli.stages.measuring import (
     ByImage,
     CutTask,
@@ -40,7 +37,8 @@ from aeromatch_cli.stages.measuring import (
     measurement_fingerprint,
     patches_of,
 )
-from aeromatch_cli.stages.stage_report import StageReport, forget, whole_record
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.refiners.least_squares import LeastSquares
 
@@ -57,9 +55,9 @@ def run(context: Context) -> StageReport:
         _remove(folder)
         report.result = RefineResult()
         return report.write(context.workspace)
-    context, _ = with_current_pairs(context)
+    context, _ = BlockState.of(context).with_current_pairs()
     report.items = len(context.block.images)
-    report.fingerprint = fingerprint(*_versions(), recipe, inputs_fingerprint(context, "refine"))
+    report.fingerprint = fingerprint(*_versions(), recipe, BlockState.of(context).inputs("refine"))
     if _is_up_to_date(context, report):
         return report.write(context.workspace)
     _make_room(context)
@@ -75,7 +73,7 @@ def run(context: Context) -> StageReport:
 def _is_up_to_date(context: Context, report: StageReport) -> bool:
     """Whether what is on file is of these matches, and nothing more can be measured: pictures of images that failed
     still cannot be read. Then these are the failures of this run, too."""
-    record = whole_record(context, report.stage)
+    record = context.recorded(report.stage)
     result = RefineResult.of_json(record.get("result"))
     if record.get("fingerprint") != report.fingerprint or result is None:
         return False
@@ -110,7 +108,7 @@ def _make_room(context: Context) -> None:
     is to be made anew."""
     workspace = context.workspace
     folder, kept = workspace.refined("").parent, workspace.measured("").parent
-    forget(context, "refine")
+    context.workspace.forget("refine")
     if context.scope.overwrite:
         _remove(folder)
     with translated_os_errors(kept):
@@ -146,7 +144,7 @@ class _Table:
         matches, scores = [], [np.zeros(0, np.float32)]
         used: dict[str, BoolArray] = {}
         places = _places(context)
-        for pair, entry in verified_pairs(context):
+        for pair, entry in BlockState.of(context).verified_pairs():
             # Without both attitudes nobody knows how one image's surroundings look in the other.
             if entry.verdict.state == "verified" and _comparable(context.geometry(pair)):
                 ids = pair.image_id0, pair.image_id1

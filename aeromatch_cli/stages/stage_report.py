@@ -8,11 +8,11 @@ import time
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from aeromatch_cli import graph
 from aeromatch_cli.data import Pair
-from aeromatch_cli.files import read_json, translated_os_errors, write_json, write_text
+from aeromatch_cli.files import read_json, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.results.stages import StageResult
 from aeromatch_cli.stages.context import Context
@@ -94,39 +94,12 @@ class StageReport:
     def is_up_to_date(self, context: Context) -> bool:
         """Whether what a stage of the whole block has left is of this report's fingerprint, and as it was written. Then
         the report has its result, and all items are skipped."""
-        record = whole_record(context, self.stage)
+        record = context.recorded(self.stage)
         result = graph.BY_NAME[self.stage].result.of_json(record.get("result"))
         if record.get("fingerprint") != self.fingerprint or record["failures"] or result is None:
             return False
         self.skipped, self.result, self.files = self.items, result, record.get("files", {})
         return True
-
-
-def whole_record(context: Context, stage: str) -> dict[str, Any]:
-    """Return the report that a stage of the whole block has left, where the files that it names are as they were
-    written; else nothing, and a word says which is not. Nothing, too, where all is made anew."""
-    workspace = context.workspace
-    path = workspace.stage_report(stage)
-    if context.scope.overwrite or not path.is_file():
-        return {}
-    record = read_json(path)
-    changed = context.store.changed(workspace.root, record.get("files", {}))
-    if changed:
-        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-        log.warning(
-            "warning: %s%s was changed or removed since it was written, and counts as absent",
-            workspace.root / changed[0],
-            more,
-        )
-    return {} if changed else record
-
-
-def forget(context: Context, stage: str, paths: Iterable[Path] = ()) -> None:
-    """Remove what a stage of the whole block has left: first its report, so that where the command is stopped nothing
-    vouches for what is then made of something else."""
-    for path in (context.workspace.stage_report(stage), *paths):
-        with translated_os_errors(path):
-            path.unlink(missing_ok=True)
 
 
 def result_on_file(workspace: Workspace, kind: type[R]) -> R | None:

@@ -28,11 +28,12 @@ from aeromatch_cli.formats.rows import (
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import ExtractResult, MatchResult
-from aeromatch_cli.stages import cascade, extract, match
+from aeromatch_cli.stages import cascade, extract
 from aeromatch_cli.stages.cascade import StepContext
 from aeromatch_cli.stages.context import Context, Union
 from aeromatch_cli.stages.driver import PairTask, RowResult, run_rows, run_stage
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, result_on_file
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.store.block_store import KnownFeatures, KnownMatches, matches_of
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.workspace import Workspace
@@ -81,14 +82,14 @@ def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
         for step in _matched(steps, pair):
             verdict = step.context.store.verdicts(key[0]).get(key[1])
             judged = None if verdict is None else verdict.fingerprint
-            found.append((step.name, match.pair_fingerprint(step.context, pair), judged))
+            found.append((step.name, BlockState.of(step.context).matches(pair), judged))
         matches[key] = fingerprint(VERSION, found, features[key[0]], features[key[1]])
     return context.with_scope(union=Union(features, matches))
 
 
 def _usable(steps: Sequence[StepContext]) -> list[tuple[StepContext, set[str]]]:
     """Steps with features of their own, and the images that have them."""
-    return [(step, extract.current(step.context, step.images)) for step in steps if step.own_features]
+    return [(step, BlockState.of(step.context).with_features(step.images)) for step in steps if step.own_features]
 
 
 def _matched(steps: Sequence[StepContext], pair: Pair) -> list[StepContext]:
@@ -99,7 +100,7 @@ def _matched(steps: Sequence[StepContext], pair: Pair) -> list[StepContext]:
         for step in steps
         if (id0, id1) in step.reasons
         and (known := step.context.store.matches(id0).get(id1)) is not None
-        and known.fingerprint == match.pair_fingerprint(step.context, pair)
+        and known.fingerprint == BlockState.of(step.context).matches(pair)
     ]
 
 
@@ -214,7 +215,7 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
 def _join_tasks(context: Context, steps: Sequence[StepContext]) -> list[JoinTask]:
     """Return one task per row that has a pair with matches."""
     assert context.scope.union is not None
-    tasks, ready = [], extract.current(context, {image.image_id for image in context.block.images})
+    tasks, ready = [], BlockState.of(context).with_features({image.image_id for image in context.block.images})
     for image_id0, pairs in context.rows().items():
         wanted, own = [], {}
         for pair in pairs:

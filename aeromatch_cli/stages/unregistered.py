@@ -9,9 +9,9 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import verified_pairs
 from aeromatch_cli.stages.simulate import degenerate_view
 from aeromatch_cli.stages.stage_report import gather_failures
+from aeromatch_cli.stages.state import BlockState
 
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
@@ -25,7 +25,7 @@ def unregistered_reasons(context: Context, adjusted: AdjustedBlock) -> dict[str,
     pairs = Counter(i for p in context.pairs for i in (p.image_id0, p.image_id1))
     verified: Counter[str] = Counter()
     tied: Counter[str] = Counter()
-    for pair, entry in verified_pairs(context):
+    for pair, entry in BlockState.of(context).verified_pairs():
         if entry.verdict.state == "verified":
             ends = pair.image_id0, pair.image_id1
             verified.update(ends)

@@ -7,6 +7,7 @@ absent here; whoever reads its arrays says that it is.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ from aeromatch_cli.formats.reading import say_damaged
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace
+
+log = logging.getLogger("aeromatch")
 
 _FEATURES, _MATCHES, _VERDICTS, _RECORD, _DIGEST = "features", "matches", "verdicts", "record", "digest"
 
@@ -111,6 +114,18 @@ class BlockStore:
         """Return a record in JSON, where the files that it names beside it are as they were written; else nothing."""
         found: dict[str, Any] = self._known(_RECORD, path, read_json) or {}
         return {} if self.changed(path.parent, found.get("files", {})) else found
+
+    def report(self, stage: str) -> dict[str, Any]:
+        """Return the report that a stage of the whole block has left, where the files that it names are as they were
+        written; else nothing, and a word says which is not."""
+        path = self.workspace.stage_report(stage)
+        record = read_json(path) if path.is_file() else {}
+        changed = self.changed(self.workspace.root, record.get("files", {}))
+        if changed:
+            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+            words = "was changed or removed since it was written, and counts as absent"
+            log.warning("warning: %s%s %s", self.workspace.root / changed[0], more, words)
+        return {} if changed else record
 
     def changed(self, folder: Path, digests: Mapping[str, str]) -> list[str]:
         """Return the names of files below a folder that are gone or have other digests than these."""

@@ -12,6 +12,7 @@ from aeromatch_cli.data import Features, FloatArray, Pair
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.stages import extract
 from aeromatch_cli.stages import filter as filtering
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies.filters import apply_chain
 from benchmarks.peers.base import Found, Options, Scene, prepared
 
@@ -59,7 +60,7 @@ class Preset:
         matches = self.context.settings.match(features0, features1, geometry)
         sides = [(features.keypoints_px, features.colours) for features in (features0, features1)]
         candidates = filtering.candidates(matches, *sides)
-        seed = filtering.pair_seed(self.context, pair)
+        seed = BlockState.of(self.context).seed(pair)
         verdict = apply_chain(self.context.settings.filter, candidates, geometry, seed)
         sides_enhanced = [f.view_enhanced[v] for f, v in zip((features0, features1), matches.view_pairs.T, strict=True)]
         enhanced = bool(np.any(sides_enhanced))
