@@ -1,4 +1,4 @@
-"""Files of the workspace that are damaged or lost, and images that are away for a while: the next run mends it."""
+"""Damage that is named, and images that are away for a while. What is damaged is made again: test_every_stage.py."""
 
 from __future__ import annotations
 
@@ -14,37 +14,6 @@ from aeromatch_cli.images.source import Source
 from aeromatch_cli.stages import enhance
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.mark.parametrize("damage", ["cut", "empty", "other"])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "features/{0}.npz",
-        "matches/{0}.npz",
-        "verified/{0}.npz",
-        "block.json",
-        "pairs.csv",
-        "images.csv",
-        "reports/filter.json",
-        "reports/export.json",
-        "orientation/orientation.json",
-        "orientation/poses.csv",
-    ],
-)
-def test_damaged_files_are_made_again(done_site, name, damage):
-    expected = contents(done_site.work)
-    path = done_site.work / name.format(done_site.names()[0].replace(".", "_"))
-    data = path.read_bytes()
-    if damage == "other" and path.suffix == ".npz":
-        with path.open("wb") as stream:
-            np.savez(stream, fingerprint=np.array("x"), image_id1=np.array(["y"]))
-    else:
-        damaged = {"cut": data[: len(data) // 2], "empty": b"", "other": b"\x80[1, 2]"}
-        path.write_bytes(damaged[damage])
-    outcome = done_site("run")
-    assert outcome.code == 0
-    assert contents(done_site.work) == expected
 
 
 def test_a_damaged_adjustment_is_named(done_site):
@@ -70,14 +39,6 @@ def test_a_page_made_while_the_clock_was_ahead_is_made_again(done_site):
     before = (done_site.work / "report" / "index.html").read_text()
     assert done_site("run", *page, "--set", "pairs.min_overlap=0.7").done()["report"] == 1
     assert (done_site.work / "report" / "index.html").read_text() != before
-
-
-@pytest.mark.parametrize("name", ["database.db", "sparse/images.txt", "world.json"])
-def test_a_lost_file_of_the_export_is_written_again(done_site, name):
-    expected = contents(done_site.work)
-    (done_site.work / "export" / "colmap" / name).unlink()
-    assert done_site("run").done() == {"export": 1}
-    assert contents(done_site.work) == expected
 
 
 def test_an_image_that_could_not_be_read_for_a_while_leaves_no_trace(
