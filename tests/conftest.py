@@ -6,7 +6,6 @@ import csv
 import fcntl
 import hashlib
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -24,7 +23,6 @@ import forked
 import pytest
 import threadpoolctl
 import typer.testing
-from benchmarks import processes
 from hypothesis import settings
 from typer.testing import CliRunner
 
@@ -121,12 +119,10 @@ def command_line_made_once() -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def mappers_forked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Mappers and adjustments of commands that run in this process do not load their libraries each time, and are run
-    once for the same input; processes of benchmarks do not load theirs either."""
+    once for the same input."""
     kept = _shared(tmp_path_factory) / "mapped"
-    forks = SimpleNamespace(get_context=lambda _: multiprocessing.get_context("forkserver"))
     with forked.server(), pytest.MonkeyPatch.context() as patched:
         patched.setattr(process, "subprocess", SimpleNamespace(run=partial(forked.kept_run, kept)))
-        patched.setattr(processes, "multiprocessing", forks)
         yield
 
 
