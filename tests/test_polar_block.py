@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from pathlib import Path
 
@@ -75,3 +76,13 @@ def test_a_second_run_makes_nothing(work: Path, grass: Path) -> None:
     outcome = invoke("run", "polar", *block, "--workspace", work, "--jobs", 1, "--json", *PLAIN)
     assert outcome.code == 0
     assert not {"extract", "match", "filter"} & outcome.done().keys()
+
+
+def test_the_page_shows_residuals_at_the_measured_places(work: Path, grass: Path) -> None:
+    """Points of polar registration are no keypoints: those of the features would be hundreds of pixels off."""
+    block = ["--images", grass / "images", "--poses", grass / "poses_noisy.csv", "--cameras", grass / "block.json"]
+    assert invoke("report", "polar", *block, "--workspace", work, "--jobs", 1, *PLAIN).code == 0
+    page = (work / "report" / "index.html").read_text(encoding="utf-8")
+    remaining = re.search(r"What remains: .*? up to ([\d.]+) px", page)
+    assert remaining is not None
+    assert float(remaining[1]) < 1.0

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
-from aeromatch_cli.data import AdjustedBlock, FloatArray
+from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.files import write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
-from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.report.adjustment import (
     PRINCIPAL_POINT,
@@ -53,7 +52,7 @@ from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.report.thumbnails import thumbnails
 from aeromatch_cli.results.stages import FilterResult, MatchResult, OrientResult, PairsResult, ReportResult
 from aeromatch_cli.sfm.quality.finding import Finding, Quality, plain
-from aeromatch_cli.sfm.shutter import at_once
+from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, connection
 from aeromatch_cli.stages.messages import settled_words
@@ -221,11 +220,7 @@ def _figure(finding: Finding) -> str:
 def _cameras(context: Context, adjustment: Adjustment, adjusted: AdjustedBlock | None) -> list[CameraSection]:
     if adjusted is None:
         return []
-
-    def keypoints_px(image_id: str) -> FloatArray:
-        return read_final_keypoints(context.workspace.features(image_id), context.workspace.refined(image_id))
-
-    seen_px = at_once(adjusted, adjusted.cameras_of(context.block), keypoints_px)
+    seen_px = contents_of(context, adjusted, raw=False).keypoints_px
     return camera_sections(adjustment.found, adjusted, context.block.images, seen_px)
 
 
