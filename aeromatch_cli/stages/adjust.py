@@ -38,7 +38,7 @@ _NOTHING = "not done: no image is oriented; exports have poses only where some a
 
 
 def run(context: Context) -> StageReport:
-    """Write adjusted.npz, adjusted.json, orientation.csv and residuals.csv where they are not up to date."""
+    """Write adjusted.npz, orientation.csv and residuals.csv where they are not up to date."""
     report = StageReport("adjust", items=len(context.block.images))
     first_pass, groups = context.settings.first_pass, _groups(context)
     if not groups:
