@@ -15,11 +15,14 @@ import uuid
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.reading import readable
+from aeromatch_cli.results.record import Record
+
+R = TypeVar("R", bound=Record)
 
 log = logging.getLogger("aeromatch")
 # What precedes the checksum of a JSON file.
@@ -108,6 +111,12 @@ def read_json(path: Path) -> dict[str, Any]:
             raise ValueError("its contents contradict its checksum")
         del value["checksum"]
     return value
+
+
+def read_record(path: Path, kind: type[R]) -> R | None:
+    """Return the record that a file holds; None where there is no file, or one of another version. Raises
+    BrokenFileError."""
+    return kind.of_json(read_json(path)) if path.is_file() else None
 
 
 def json_object(text: str) -> dict[str, Any]:

@@ -17,12 +17,13 @@ from aeromatch_cli.errors import InputError, WorkspaceError
 from aeromatch_cli.files import (
     changed_files,
     json_object,
-    read_json,
+    read_record,
     remove_stale_temporaries,
     temporary_name,
     translated_os_errors,
 )
 from aeromatch_cli.formats.reading import readable
+from aeromatch_cli.results.record import StageRecord
 
 FORMAT_VERSION = 1
 
@@ -191,8 +192,8 @@ class Workspace:
     def changed_tables(self) -> list[str]:
         """Names of the tables of the block that are not as they were written, or gone. Raises as `check_version`."""
         self.check_version()
-        path = self.stage_report("pairs")
-        return changed_files(self.root, read_json(path).get("files", {})) if path.is_file() else []
+        record = read_record(self.stage_report("pairs"), StageRecord)
+        return [] if record is None else changed_files(self.root, record.files)
 
     def check_tables(self) -> None:
         """Raises WorkspaceError where a table of the block is not as it was written."""

@@ -10,11 +10,11 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from aeromatch_cli import graph
-from aeromatch_cli.files import read_json
+from aeromatch_cli.files import read_json, read_record
 from aeromatch_cli.formats.tables import read_csv
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import (
     AdjustResult,
     ConsistencyResult,
@@ -29,6 +29,7 @@ from aeromatch_cli.results.stages import (
     ViewsResult,
 )
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.stage_report import result_of
 from aeromatch_cli.store.naming import item_named
 from aeromatch_cli.workspace import Workspace
 
@@ -121,13 +122,13 @@ class EvaluationFigures:
 def stage_rows(workspace: Workspace) -> list[StageRow]:
     """Last run of every stage in the order of the chain; the shards of one stage are summed, over all steps of a
     cascade, whose shards report in the folders of the steps."""
-    groups: dict[tuple[str, bool], list[dict[str, Any]]] = {}
+    groups: dict[tuple[str, bool], list[StageRecord]] = {}
     shards: dict[str, set[str]] = {}
     for path, report in _reports(workspace):
         shard = re.fullmatch(r".+\.(\d+-of-\d+)", path.stem)
-        groups.setdefault((str(report["stage"]), shard is not None), []).append(report)
+        groups.setdefault((report.stage, shard is not None), []).append(report)
         if shard:
-            shards.setdefault(str(report["stage"]), set()).add(shard[1])
+            shards.setdefault(report.stage, set()).add(shard[1])
 
     order = {name: place for place, name in enumerate(graph.ORDER)}
     rows = []
@@ -136,28 +137,33 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
         if name == "report":
             continue
         reports = groups[name, sharded]
-        seconds = sum(float(report["seconds"]) for report in reports)
-        items, done, skipped, failed = (
-            sum(int(report[key]) for report in reports) for key in ("items", "done", "skipped", "failed")
+        row = StageRow(
+            f"{name} ({len(shards[name])} shards)" if sharded else name,
+            seconds=sum(report.seconds for report in reports),
+            items=sum(report.items for report in reports),
+            done=sum(report.done for report in reports),
+            skipped=sum(report.skipped for report in reports),
+            failed=sum(report.failed for report in reports),
+            facts="" if sharded else ", ".join(_details(result_of(reports[0]))),
         )
-        label = f"{name} ({len(shards[name])} shards)" if sharded else name
-        found = "" if sharded else ", ".join(_details(graph.BY_NAME[name].result.of_json(reports[0].get("result"))))
-        rows.append(StageRow(label, seconds, items, done, skipped, failed, found))
+        rows.append(row)
     return rows
 
 
-def _reports(workspace: Workspace) -> Iterator[tuple[Path, dict[str, Any]]]:
+def _reports(workspace: Workspace) -> Iterator[tuple[Path, StageRecord]]:
     """Of all stages, and of the shards of a cascade's steps."""
     in_steps = workspace.reports.glob("*/*-of-*.json")
     for path in (*sorted(workspace.reports.glob("*.json")), *sorted(in_steps)):
-        yield path, read_json(path)
+        record = read_record(path, StageRecord)
+        if record is not None and record.stage in graph.BY_NAME:
+            yield path, record
 
 
 def seconds_by_stage(workspace: Workspace) -> dict[str, float]:
     """Of the last run of every stage, with those of its shards."""
     found: dict[str, float] = {}
     for _, report in _reports(workspace):
-        found[str(report["stage"])] = found.get(str(report["stage"]), 0.0) + float(report["seconds"])
+        found[report.stage] = found.get(report.stage, 0.0) + report.seconds
     return found
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from aeromatch_cli import graph
 from aeromatch_cli.data import BoolArray, Image, Pose, Verdict
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
-from aeromatch_cli.files import read_json
+from aeromatch_cli.files import read_json, read_record
 from aeromatch_cli.formats.archives import ARCHIVE_FAULTS
 from aeromatch_cli.formats.reading import readable
 from aeromatch_cli.formats.tables import read_csv
@@ -26,12 +26,13 @@ from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult
 from aeromatch_cli.sfm.quality.finding import Quality
 from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.inspect_image import steps_of_image
 from aeromatch_cli.stages.quality import quality_on_file
-from aeromatch_cli.stages.stage_report import result_on_file
+from aeromatch_cli.stages.stage_report import result_of, result_on_file
 from aeromatch_cli.store.matches import match_points
 from aeromatch_cli.store.opened import OpenedBlock
 from aeromatch_cli.workspace import Workspace
@@ -132,11 +133,11 @@ def _stage_lines(workspace: Workspace) -> Iterator[str]:
     seconds = seconds_by_stage(workspace)
     for stage in graph.ORDER:
         path = workspace.stage_report(stage)
-        if not path.is_file():
+        found = read_record(path, StageRecord)
+        if found is None:
             continue
-        found = read_json(path)
-        yield f"{stage:<11} {found['items']} items, {found['failed']} failed, {seconds[stage]:.1f} s"
-        match graph.BY_NAME[stage].result.of_json(found.get("result")):
+        yield f"{stage:<11} {found.items} items, {found.failed} failed, {seconds[stage]:.1f} s"
+        match result_of(found):
             case FilterResult() as judged:
                 states = ", ".join(f"{count} {state}" for state, count in judged.pairs.items())
                 yield f"            {states}; {judged.verified_matches} verified matches"

@@ -23,3 +23,23 @@ class Record(BaseModel):
             return cls.model_validate(value)
         except ValidationError:
             return None
+
+
+class StageRecord(Record):
+    """What a stage has left: the contents of reports/<stage>.json. Ids name images.
+
+    items = done (made by the run that wrote it) + skipped (up to date already) + failed; items are images, pairs or
+    exporters. result: of the stage's own type. failures: item and reason. files: SHA-256 of the files that a stage of
+    the whole block has written, by their names in the workspace.
+    """
+
+    stage: str
+    seconds: float = 0.0
+    items: int = 0
+    done: int = 0
+    skipped: int = 0
+    failed: int = 0
+    fingerprint: str = ""
+    result: dict[str, Any] | None = None
+    failures: list[tuple[str, str]] = []
+    files: dict[str, str] = {}

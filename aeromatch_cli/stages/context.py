@@ -20,6 +20,7 @@ from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.footprints import block_footprints, degenerate_words
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import scale_within, shrink_camera
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.sfm.focal import with_focal_length
 from aeromatch_cli.sfm.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
@@ -129,9 +130,9 @@ class Context:
         """Return what the workspace holds."""
         return BlockStore(self.workspace, self.index)
 
-    def recorded(self, stage: str) -> dict[str, Any]:
-        """Return the report of a stage of the whole block as `BlockStore.report`; nothing where all is made anew."""
-        return {} if self.scope.overwrite else self.store.report(stage)
+    def recorded(self, stage: str) -> StageRecord | None:
+        """Return what a stage of the whole block has left, as `BlockStore.report`; None where all is made anew."""
+        return None if self.scope.overwrite else self.store.report(stage)
 
     @property
     def observed(self) -> Observed:

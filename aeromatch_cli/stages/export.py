@@ -41,12 +41,12 @@ def run(context: Context) -> StageReport:
     report.items, report.fingerprint = len(context.settings.export), wanted
     folders = [context.workspace.export(exporter.name) for exporter in context.settings.export]
     record = context.recorded("export")
-    before = ExportResult.of_json(record.get("result"))
+    before = None if record is None or record.fingerprint != wanted else ExportResult.of_json(record.result)
     # None has failed where all have a result; of pairs that are missing the report may tell failures all the same.
-    if record.get("fingerprint") == wanted and before and before.exporters.keys() == {path.name for path in folders}:
+    if record and before and before.exporters.keys() == {path.name for path in folders}:
         if context.workspace.export_is_older:  # by its time alone: what was made since is the same
             context.workspace.stage_report("export").touch()
-        report.skipped, report.result, report.files = report.items, before, record["files"]
+        report.skipped, report.result, report.files = report.items, before, record.files
         report.failures = unexplained(context, outdated, "filter")
         return report.write(context.workspace)
     context.workspace.forget("export")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import Candidates, FloatArray, Matches, Pair
-from aeromatch_cli.files import read_json, write_atomically
+from aeromatch_cli.files import read_record, write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import (
@@ -23,6 +23,7 @@ from aeromatch_cli.formats.rows import (
 )
 from aeromatch_cli.geometry.components import labels_by_name
 from aeromatch_cli.recent import read_once
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import FilterResult
 from aeromatch_cli.stages import driver
 from aeromatch_cli.stages.context import Context
@@ -128,11 +129,12 @@ def run(context: Context) -> StageReport:
 def _result_on_file(context: Context, report: StageReport) -> FilterResult | None:
     """Return the result of the last run, where nothing was made now and the verdicts are the same ones; else None."""
     last = context.workspace.stage_report(report.stage, context.scope.shard.label if context.scope.shard else "")
-    if report.done or report.failures or context.scope.overwrite or not last.is_file():
+    if report.done or report.failures or context.scope.overwrite:
         return None
-    found = read_json(last)
-    same = found.get("fingerprint") == report.fingerprint and not found["failed"]
-    return FilterResult.of_json(found.get("result")) if same else None
+    record = read_record(last, StageRecord)
+    if record is None or record.fingerprint != report.fingerprint or record.failed:
+        return None
+    return FilterResult.of_json(record.result)
 
 
 def connection(context: Context, judged: Iterable[tuple[str, str, str, int]] | None = None) -> FilterResult:

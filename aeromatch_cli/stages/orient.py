@@ -6,19 +6,20 @@ the pictures. Later stages read the result from the workspace's orientation fold
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, Ground
-from aeromatch_cli.files import read_json, translated_os_errors, write_bytes, write_json, write_text
+from aeromatch_cli.files import read_record, translated_os_errors, write_bytes, write_json, write_text
 from aeromatch_cli.fingerprints import fingerprint, mask_fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.images.masks import mask_path
+from aeromatch_cli.results.record import Record
 from aeromatch_cli.results.stages import FurtherFirstPass, OrientResult
 from aeromatch_cli.sfm.dem import Terrain, continued
 from aeromatch_cli.sfm.earlier_datum import Before
@@ -45,10 +46,34 @@ from aeromatch_cli.strategies.orienters import FirstPass
 
 # The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
 VERSION, _LARGE_BLOCK_VERSION = 25, 1
-# What was found, of what, and which pairs the first pass has verified.
 _DATA = "orientation/orientation.json"
 # What failures.csv calls the mapper's process.
 _MAPPING = "mapping"
+
+
+class OrientedGroup(Record):
+    """Images that one orientation holds. kind: "given", or how they were put into the world."""
+
+    kind: str
+    images: tuple[str, ...]
+
+
+class OrientationRecord(Record):
+    """What was found, of what, and which pairs the first pass has verified: the contents of orientation.json.
+
+    settings, images: fingerprints of the settings, and by image_id of what was given. tied: pairs with verified
+    matches. similar: pairs that look alike. failed: images that could not be read, and the mapper where it stopped,
+    which the next run tries again. terrains: files beside it, the largest flight's first.
+    """
+
+    settings: str
+    images: dict[str, str]
+    tied: list[tuple[str, str]]
+    similar: list[tuple[str, str]]
+    failed: list[str]
+    result: OrientResult
+    groups: list[OrientedGroup]
+    terrains: list[str]
 
 
 def run(
@@ -67,25 +92,25 @@ def run(
     images, settings = _prints(context)
     # A block that grows large is oriented anew, but where its images were.
     report.fingerprint = fingerprint(images, settings, first_pass.is_large(context.block))
-    before = _on_file(context)
-    record: Mapping[str, Any] | None = before if before.get("fingerprint") == report.fingerprint else None
+    before, made_of = _on_file(context)
+    record = before if made_of == report.fingerprint else None
     if record is None and dry:
         return context, report
     recipe = first_pass.fitted(recipe, context.block)
-    if record is not None and not dry and record["failed"] and first_pass.mended(context, recipe, record["failed"]):
+    if record is not None and not dry and record.failed and first_pass.mended(context, recipe, record.failed):
         # What is made without some of its images is no beginning to go on from.
-        record, before = None, {}
+        record = before = None
     if record is None:
-        same = before.get("settings") == settings
-        kept = {i for i, value in images.items() if same and before.get("images", {}).get(i) == value}
-        solution, seen = _solution(context, recipe, kept, before)
-        record = _write(context, solution, {"settings": settings, "images": images, **seen})
+        known = before.images if before is not None and before.settings == settings else {}
+        kept = {image_id for image_id, made_of in images.items() if known.get(image_id) == made_of}
+        solution, seen = _solution(context, recipe, before if kept else None, kept)
+        record = _write(context, solution, settings=settings, images=images, **seen)
         report.done = report.items
     else:
         report.skipped = report.items
     report.vouches_for(context, _files(context, record))
     folder = context.workspace.orientation
-    found = OrientResult(**record["result"])
+    found = record.result
     ground, source, ground_remarks = judged_ground(context, _terrains(context, record), found)
     remarks = [*found.remarks, *frame_remarks(found, _groups(record)), *ground_remarks]
     remarks += judged_altitudes(ground, context.block, found, altitudes)
@@ -103,12 +128,12 @@ def run(
         poses=read_poses(folder / "poses.csv"),
         ground=ground,
         ground_source=source,
-        tied=tuple((id0, id1) for id0, id1 in record["tied"]),
-        similar=tuple((id0, id1) for id0, id1 in record["similar"]),
+        tied=tuple(record.tied),
+        similar=tuple(record.similar),
         outside=frozenset(found.outside),
         calibrated=frozenset(found.calibrated),
     )
-    report.failures = _failed_images(context, record["failed"])
+    report.failures = _failed_images(context, record.failed)
     if found.stopped:
         report.failures.append((_MAPPING, found.stopped))
     context = replace(context, block=block)
@@ -126,21 +151,22 @@ def _failed_images(context: Context, failed: Sequence[str]) -> list[tuple[str, s
 
 def groups(context: Context) -> list[Group]:
     """Return images that the orientation on file holds, the largest group first; none without an orientation."""
-    return _groups(_on_file(context.with_scope(overwrite=False)))
+    record, _ = _on_file(context.with_scope(overwrite=False))
+    return [] if record is None else _groups(record)
 
 
-def _groups(record: Mapping[str, Any]) -> list[Group]:
-    return [Group(str(one["kind"]), tuple(one["images"])) for one in record.get("groups", ()) if one["images"]]
+def _groups(record: OrientationRecord) -> list[Group]:
+    return [Group(one.kind, one.images) for one in record.groups if one.images]
 
 
 def _solution(
-    context: Context, recipe: FirstPass, kept: set[str], before: Mapping[str, Any]
+    context: Context, recipe: FirstPass, before: OrientationRecord | None, kept: set[str]
 ) -> tuple[Solution, dict[str, Any]]:
     """Find the orientation from the first pass; return it with the pairs of that pass, those that look alike, and what
     failed.
 
-    kept: images that have not changed since an earlier run, whose poses and terrain stay as they were where the new
-    ones agree with them. before: the record of that run.
+    before: what an earlier run has found, None where no image is as it was. kept: images that are, whose poses and
+    terrain stay as they were where the new ones agree with them.
     """
     block = context.block
     given = sum(pose.world_rotation is not None for pose in block.poses.values())
@@ -163,7 +189,7 @@ def _solution(
         mapped, tried = best_mapped(context, recipe, first, evidence)
         models, first, evidence, stopped = mapped.models, mapped.first, mapped.evidence, mapped.stopped
         exchanged = exchanged_columns(block, models[0]) if models and mapped.contradicted else ""
-        solution = from_models(evidence, models, _before(context, kept, before), context.given.angles, exchanged)
+        solution = from_models(evidence, models, _before(context, before, kept), context.given.angles, exchanged)
         if not models and not stopped:
             solution.result.remarks.append(unoriented_remark(evidence))
         if not recipe.replaces:
@@ -180,7 +206,7 @@ def _solution(
         "failed": [*evidence.failed, *([_MAPPING] if stopped else [])],  # is tried again by the next run
     }
     terrains = solution.terrains
-    old = _terrains(context, before) if kept else ()
+    old = () if before is None else _terrains(context, before)
     if len(old) == len(terrains):
         centers_m = np.array([pose.center_m for pose in solution.poses.values()])
         terrains = tuple(continued(one, new, centers_m) for one, new in zip(old, terrains, strict=True))
@@ -203,13 +229,13 @@ def _with_better_cameras(
     )
 
 
-def _before(context: Context, kept: set[str], record: Mapping[str, Any]) -> Before:
-    if not kept:
+def _before(context: Context, record: OrientationRecord | None, kept: set[str]) -> Before:
+    if record is None:
         return Before()
     folder = context.workspace.orientation
     poses = read_poses(folder / "poses.csv")
     held = {i: pose for i, pose in poses.items() if i in kept and pose.world_rotation is not None}
-    placing = [one["images"] for one in record["groups"] if one["kind"] != "level"]
+    placing = [one.images for one in record.groups if one.kind != "level"]
     return Before(held, read_cameras(folder / "cameras.csv"), {i for images in placing for i in images})
 
 
@@ -234,16 +260,17 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
     return images, fingerprint(VERSION, library_version("pycolmap"), how, block.crs, block.origin_m)
 
 
-def _on_file(context: Context) -> Mapping[str, Any]:
-    """What an earlier run has found and of what, where its files are as they were written; else nothing."""
+def _on_file(context: Context) -> tuple[OrientationRecord | None, str]:
+    """Return what an earlier run has found, and the fingerprint of what it was made of, where its files are as they
+    were written; else nothing."""
     report = context.recorded("orient")
-    if _DATA not in report.get("files", {}):
-        return {}
-    return {**read_json(context.workspace.root / _DATA), "fingerprint": report["fingerprint"]}
+    if report is None or _DATA not in report.files:
+        return None, ""
+    return read_record(context.workspace.root / _DATA, OrientationRecord), report.fingerprint
 
 
-def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dict[str, Any]:
-    """Write what was found; return the contents of orientation.json, which begins with `head`."""
+def _write(context: Context, solution: Solution, **seen: Any) -> OrientationRecord:
+    """Write what was found; return the record. seen: the other fields of it."""
     workspace = context.workspace
     folder = workspace.orientation
     context.workspace.forget("orient")
@@ -258,25 +285,24 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
     with translated_os_errors(folder):
         for old in set(folder.glob("terrain*.tif")) - {folder / name for name in names}:
             old.unlink(missing_ok=True)
-    held = [asdict(group) for group in solution.groups]
-    write_json(workspace.root / _DATA, {**head, "result": solution.result.as_json(), "groups": held, "terrains": names})
-    return read_json(workspace.root / _DATA)
+    held = [OrientedGroup(kind=group.kind, images=group.images) for group in solution.groups]
+    record = OrientationRecord(**seen, result=solution.result, groups=held, terrains=names)
+    write_json(workspace.root / _DATA, record.as_json())
+    return record
 
 
-def _files(context: Context, record: Mapping[str, Any]) -> list[Path]:
+def _files(context: Context, record: OrientationRecord) -> list[Path]:
     """Return the files of an orientation."""
     workspace = context.workspace
-    names = ("cameras.csv", "poses.csv", *record["terrains"])
+    names = ("cameras.csv", "poses.csv", *record.terrains)
     return [workspace.root / _DATA, *(workspace.orientation / name for name in names)]
 
 
-def _terrains(context: Context, record: Mapping[str, Any]) -> tuple[Terrain, ...]:
-    """Read the terrains on file, the largest flight's first. record: orientation.json."""
-    if not record.get("terrains"):
-        return ()
-    origin_m, _ = _frame(context, OrientResult(**record["result"]))
+def _terrains(context: Context, record: OrientationRecord) -> tuple[Terrain, ...]:
+    """Read the terrains on file, the largest flight's first."""
+    origin_m, _ = _frame(context, record.result)
     folder = context.workspace.orientation
-    return tuple(Terrain(*read_terrain(folder / name, origin_m)) for name in record["terrains"])
+    return tuple(Terrain(*read_terrain(folder / name, origin_m)) for name in record.terrains)
 
 
 def _frame(context: Context, found: OrientResult) -> tuple[FloatArray, str]:

@@ -12,9 +12,10 @@ from aeromatch_cli.config import Settings, dump
 from aeromatch_cli.data import Block, Pair, PictureQuality
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.files import read_json, write_json, write_text
+from aeromatch_cli.files import read_record, write_json, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import OrientResult, PairsResult
 from aeromatch_cli.stages import orient, picture_quality
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
@@ -229,11 +230,11 @@ def _fingerprint(context: Context) -> str:
 
 def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
     """The pairs on file, if the report that vouches for them is about exactly this file."""
-    path = workspace.stage_report("pairs")
-    report = read_json(path) if path.is_file() else {}
-    digest = report.get("files", {}).get(workspace.pairs.name)
-    known = report.get("fingerprint") == wanted and workspace.pairs.is_file() and file_digest(workspace.pairs) == digest
-    return read_pairs(workspace.pairs) if known else None
+    record = read_record(workspace.stage_report("pairs"), StageRecord)
+    if record is None or record.fingerprint != wanted or not workspace.pairs.is_file():
+        return None
+    same = file_digest(workspace.pairs) == record.files.get(workspace.pairs.name)
+    return read_pairs(workspace.pairs) if same else None
 
 
 def _write(context: Context, pairs_csv: str, quality: Mapping[str, PictureQuality]) -> list[Path]:

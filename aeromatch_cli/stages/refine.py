@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from aeromatch_cli.files import translated_os_errors, write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_keypoints, write_refined
 from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import RefineResult
 from aeromatch_cli.sfm.spanning_trees import Trees, shifts_through, trees_of
 from aeromatch_cli.stages.context import Context
@@ -74,8 +75,10 @@ def _is_up_to_date(context: Context, report: StageReport) -> bool:
     """Whether what is on file is of these matches, and nothing more can be measured: pictures of images that failed
     still cannot be read. Then these are the failures of this run, too."""
     record = context.recorded(report.stage)
-    result = RefineResult.of_json(record.get("result"))
-    if record.get("fingerprint") != report.fingerprint or result is None:
+    if record is None or record.fingerprint != report.fingerprint:
+        return False
+    result = RefineResult.of_json(record.result)
+    if result is None:
         return False
     lacking = _lacking(record)
     sources = [source_of(context, context.image_by_id[image_id]) for image_id in lacking]
@@ -84,14 +87,14 @@ def _is_up_to_date(context: Context, report: StageReport) -> bool:
     if len(report.failures) < len(lacking):
         report.failures.clear()
         return False
-    report.failures = [(item, reason) for item, reason in record["failures"]]
-    report.skipped, report.result, report.files = report.items - len(lacking), result, record.get("files", {})
+    report.failures = record.failures
+    report.skipped, report.result, report.files = report.items - len(lacking), result, record.files
     return True
 
 
-def _lacking(record: Mapping[str, Any]) -> list[str]:
+def _lacking(record: StageRecord) -> list[str]:
     """Images whose measurements failed; they are tried again as soon as their pictures can be read."""
-    return sorted({item for item, _ in record["failures"]})
+    return sorted({item for item, _ in record.failures})
 
 
 def _read(source: Source) -> bool:

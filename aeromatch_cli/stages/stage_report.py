@@ -12,8 +12,9 @@ from typing import TypeVar
 
 from aeromatch_cli import graph
 from aeromatch_cli.data import Pair
-from aeromatch_cli.files import read_json, write_json, write_text
+from aeromatch_cli.files import read_record, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import StageResult
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.shard import Shard
@@ -27,12 +28,7 @@ log = logging.getLogger("aeromatch")
 
 @dataclass
 class StageReport:
-    """Counts what one stage did; it becomes reports/<stage>.json.
-
-    items = done (made now) + skipped (up to date already) + failed; items are images, pairs or exporters. part: of a
-    step of a cascade, in words. files: of a stage of the whole block, the files that it has written, by their names in
-    the workspace, with their SHA-256.
-    """
+    """Counts what one stage does; in the end it becomes its `StageRecord`. part: of a step of a cascade, in words."""
 
     stage: str
     seconds: float = 0.0
@@ -53,21 +49,9 @@ class StageReport:
         shard has failed since, which this one supersedes.
         """
         self.seconds = round(time.perf_counter() - self.started, 3)
-        value = {
-            "stage": self.stage,
-            "seconds": self.seconds,
-            "items": self.items,
-            "done": self.done,
-            "skipped": self.skipped,
-            "failed": len(self.failures),
-            "fingerprint": self.fingerprint,
-            "result": None if self.result is None else self.result.as_json(),
-            "failures": [list(failure) for failure in self.failures],
-            **({"files": self.files} if self.files else {}),
-        }
         path = context_workspace.stage_report(self.stage, shard.label if shard else "")
         if not self._says_nothing_new(path) or (shard is None and _shard_failed_since(path)):
-            write_json(path, value)
+            write_json(path, self._record().as_json())
         gather_failures(context_workspace)
         if self.failures and self.stage != "orient":  # its first pass has named them
             names = names_on_file(context_workspace)
@@ -75,16 +59,29 @@ class StageReport:
                 log.warning("%s: %s: %s", self.stage, item_named(item, names), reason)
         return self
 
+    def _record(self) -> StageRecord:
+        return StageRecord(
+            stage=self.stage,
+            seconds=self.seconds,
+            items=self.items,
+            done=self.done,
+            skipped=self.skipped,
+            failed=len(self.failures),
+            fingerprint=self.fingerprint,
+            result=None if self.result is None else self.result.as_json(),
+            failures=self.failures,
+            files=self.files,
+        )
+
     def _says_nothing_new(self, path: Path) -> bool:
-        if self.done or not path.is_file():
+        old = None if self.done else read_record(path, StageRecord)
+        if old is None:
             return False
-        old = read_json(path)
-        before = graph.BY_NAME[self.stage].result.of_json(old.get("result"))
+        before = result_of(old)
         # Without a result of its own the stage only counts what it makes: the one on file still holds.
         self.result = self.result or before
-        failures = [list(failure) for failure in self.failures]
-        told = old.get("failures"), old.get("fingerprint"), old.get("files", {}), before
-        return told == (failures, self.fingerprint, self.files, self.result)
+        told = old.failures, old.fingerprint, old.files, before
+        return told == (self.failures, self.fingerprint, self.files, self.result)
 
     def vouches_for(self, context: Context, paths: Iterable[Path]) -> None:
         """State the files that the stage has written, as they are now."""
@@ -95,24 +92,32 @@ class StageReport:
         """Whether what a stage of the whole block has left is of this report's fingerprint, and as it was written. Then
         the report has its result, and all items are skipped."""
         record = context.recorded(self.stage)
-        result = graph.BY_NAME[self.stage].result.of_json(record.get("result"))
-        if record.get("fingerprint") != self.fingerprint or record["failures"] or result is None:
+        if record is None or record.fingerprint != self.fingerprint or record.failures:
             return False
-        self.skipped, self.result, self.files = self.items, result, record.get("files", {})
+        result = result_of(record)
+        if result is None:
+            return False
+        self.skipped, self.result, self.files = self.items, result, record.files
         return True
+
+
+def result_of(record: StageRecord) -> StageResult | None:
+    """Return the result that a stage has left, None where it is of another version."""
+    return graph.BY_NAME[record.stage].result.of_json(record.result)
 
 
 def result_on_file(workspace: Workspace, kind: type[R]) -> R | None:
     """Return the result that a stage left in its report, None where there is none, or one of another version."""
-    path = workspace.stage_report(kind.stage)
-    return kind.of_json(read_json(path).get("result")) if path.is_file() else None
+    record = read_record(workspace.stage_report(kind.stage), StageRecord)
+    return None if record is None else kind.of_json(record.result)
 
 
 def _shard_failed_since(path: Path) -> bool:
     """Whether a shard's report of the stage of this whole report is newer and names failures."""
     made_ns = path.stat().st_mtime_ns
     shards = path.parent.glob(f"{path.stem}.*-of-*.json")
-    return any(one.stat().st_mtime_ns > made_ns and read_json(one).get("failures") for one in shards)
+    newer = (read_record(one, StageRecord) for one in shards if one.stat().st_mtime_ns > made_ns)
+    return any(record is not None and record.failures for record in newer)
 
 
 def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
@@ -129,7 +134,8 @@ def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
     for stage, paths in by_stage.items():
         later: list[Shard | None] = []
         for path in sorted(paths, key=lambda path: (-path.stat().st_mtime_ns, path.name)):
-            for item, reason in read_json(path).get("failures", []):
+            record = read_record(path, StageRecord)
+            for item, reason in record.failures if record else ():
                 if not any(shard is None or shard.owns(owner(item)) for shard in later):
                     rows.add((stage, item, reason))
             label = path.stem.partition(".")[2]
@@ -158,13 +164,13 @@ def forget_absent(context: Context) -> None:
     images = {image.image_id for image in context.block.images}
     pairs = {f"{pair.image_id0} {pair.image_id1}" for pair in context.pairs}
     for path in sorted(context.workspace.reports.glob("*.json")):
-        report = read_json(path)
-        if report.get("stage") not in graph.per_item():
+        record = read_record(path, StageRecord)
+        if record is None or record.stage not in graph.per_item():
             continue
-        kept = [row for row in report["failures"] if row[0] in images or row[0] in pairs]
-        if len(kept) < len(report["failures"]):
+        kept = [(item, reason) for item, reason in record.failures if item in images or item in pairs]
+        if len(kept) < len(record.failures):
             stamp = path.stat().st_mtime_ns
-            write_json(path, {**report, "failed": len(kept), "failures": kept})
+            write_json(path, record.model_copy(update={"failed": len(kept), "failures": kept}).as_json())
             os.utime(path, ns=(stamp, stamp))
 
 

@@ -10,9 +10,10 @@ from typing import Any
 from aeromatch_cli import graph
 from aeromatch_cli.data import Pair
 from aeromatch_cli.errors import InputError
-from aeromatch_cli.files import read_json
+from aeromatch_cli.files import read_record
 from aeromatch_cli.fingerprints import canonical, combined, fingerprint, stable_hash
 from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.stages import extract
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.versions import library_version
@@ -108,8 +109,8 @@ class BlockState:
 
     def _files(self, stage: str) -> dict[str, str]:
         """Return the SHA-256 of the files that a stage has left, by their names in the workspace."""
-        path = self.context.workspace.stage_report(stage)
-        return dict(read_json(path).get("files", {})) if path.is_file() else {}
+        record = read_record(self.context.workspace.stage_report(stage), StageRecord)
+        return {} if record is None else record.files
 
     # --- what is on file ---------------------------------------------------------------------------------------------
 

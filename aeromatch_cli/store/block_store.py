@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.files import changed_files, read_json
+from aeromatch_cli.files import changed_files, read_json, read_record
 from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.features import checked_features
 from aeromatch_cli.formats.reading import say_damaged
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
+from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace
 
@@ -115,17 +116,16 @@ class BlockStore:
         found: dict[str, Any] = self._known(_RECORD, path, read_json) or {}
         return {} if self.changed(path.parent, found.get("files", {})) else found
 
-    def report(self, stage: str) -> dict[str, Any]:
-        """Return the report that a stage of the whole block has left, where the files that it names are as they were
-        written; else nothing, and a word says which is not."""
-        path = self.workspace.stage_report(stage)
-        record = read_json(path) if path.is_file() else {}
-        changed = self.changed(self.workspace.root, record.get("files", {}))
+    def report(self, stage: str) -> StageRecord | None:
+        """Return what a stage of the whole block has left, where the files that it names are as they were written; else
+        None, and a word says which is not."""
+        record = read_record(self.workspace.stage_report(stage), StageRecord)
+        changed = [] if record is None else self.changed(self.workspace.root, record.files)
         if changed:
             more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
             words = "was changed or removed since it was written, and counts as absent"
             log.warning("warning: %s%s %s", self.workspace.root / changed[0], more, words)
-        return {} if changed else record
+        return None if changed else record
 
     def changed(self, folder: Path, digests: Mapping[str, str]) -> list[str]:
         """Return the names of files below a folder that are gone or have other digests than these."""
