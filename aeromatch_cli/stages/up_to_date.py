@@ -43,9 +43,9 @@ def state_of_inputs(settings: Settings) -> str:
         return ""
     root = Path(settings.workspace)
     libraries = [f"{name} {library_version(name)}" for name in _LIBRARIES]
-    own = (path for path in _files_below(Path(__file__).parent.parent, ()) if path.suffix != ".pyc")
+    own = (path for path in _files_below(Path(__file__).parent.parent, ()) if not path.endswith(".pyc"))
     try:
-        inputs = sorted(set(_inputs(settings, root)))
+        inputs = sorted({os.fspath(path) for path in _inputs(settings, root)})
     except (ConfigError, OSError):  # a file is missing or may not be read: the run itself says so
         return ""
     return _digest([dump(settings), *libraries, *_statuses(own), *_statuses(inputs)])
@@ -83,7 +83,7 @@ def remember(workspace: Workspace, index: Index, inputs: str, reports: Sequence[
     index.remember(_FINISHED, _state(workspace, inputs), told)
 
 
-def _inputs(settings: Settings, root: Path) -> Iterator[Path]:
+def _inputs(settings: Settings, root: Path) -> Iterator[Path | str]:
     block = settings.block
     for key in PATH_KEYS:
         path = Path(getattr(block, key) or os.devnull)
@@ -106,31 +106,38 @@ def _beside(folder: Path) -> Iterator[Path]:
     return (path for path in found if path.suffix.lower() in _KINDS_BESIDE or path.name in _NAMES_BESIDE)
 
 
-def _files_below(folder: Path, passed_over: Iterable[Path]) -> Iterator[Path]:
-    """Yield all files, links followed, but of hidden folders and those passed over."""
-    visited = {os.path.realpath(path) for path in passed_over}
+def _files_below(folder: Path, passed_over: Iterable[Path]) -> Iterator[str]:
+    """Yield all files, links followed, but of hidden folders and those passed over. As text: a large block has a
+    hundred thousand, and paths take ten times as long to make as the disk takes to answer."""
+    visited = {_identity(path) for path in passed_over if path.exists()}
     for parent, folders, files in os.walk(folder, followlinks=True):
-        real = os.path.realpath(parent)
-        if real in visited:
+        own = _identity(parent)
+        if own in visited:
             folders.clear()
             continue
-        visited.add(real)
+        visited.add(own)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        yield from (Path(parent, name) for name in sorted(files))
+        yield from (f"{parent}{os.sep}{name}" for name in sorted(files))
+
+
+def _identity(folder: Path | str) -> tuple[int, int]:
+    """Return what tells a folder from all others, by whatever path it is reached."""
+    status = os.stat(folder)  # noqa: PTH116
+    return status.st_dev, status.st_ino
 
 
 def _state(workspace: Workspace, inputs: str) -> str:
     """Return a digest of the inputs and of the files of the workspace, without the index itself."""
-    passing = {workspace.lock.absolute(), workspace.index}
+    passing = {os.fspath(workspace.lock.absolute()), os.fspath(workspace.index)}
     files = (path for path in _files_below(workspace.root.absolute(), ()) if path not in passing)
     return _digest([inputs, *_statuses(files)])
 
 
-def _statuses(paths: Iterable[Path]) -> Iterator[str]:
+def _statuses(paths: Iterable[str]) -> Iterator[str]:
     """Name, size and times of each file; what cannot be asked is no file that was asked before."""
     for path in paths:
         try:
-            status = path.stat()
+            status = os.stat(path)  # noqa: PTH116
         except OSError as error:
             yield f"{path} {error.errno}"
         else:
