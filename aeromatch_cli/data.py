@@ -361,7 +361,7 @@ class JoinedKeypoints:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Correspondences of one pair.
+    """Correspondences of one pair. A keypoint is in one match at most; all arrays have the same length.
 
     indices: (M, 2) int32 into both images' keypoints, -1 for a point measured without a detector.
     scores: (M,) float32 in 0-1, larger is better. view_pairs: (M, 2) int16, the views that found each.

@@ -55,7 +55,8 @@ FILES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Stage:
-    """unit: what its items are; those of images and pairs are independent of each other. reads, writes: kinds of
+    """unit: what its items are; those of images and pairs are independent of each other, but those of refine, whose
+    files are up to date as a whole. reads, writes: kinds of
     `FILES`; what a stage writes it may read. settings: sections of the settings, and single settings, of which it is
     the first stage that reads them. in_run: whether `run` takes it; others only show what `extract` does."""
 
@@ -80,6 +81,7 @@ STAGES: tuple[Stage, ...] = (
         ("enhance", "simulate", "extract"),
     ),
     Stage(
+        # The steps of a cascade, their verification included, are made within match.
         "match", "pair", MatchResult, ("tables", "orientation", "features"), ("matches", "verified", "steps"),
         ("match", "cascade"),
     ),
@@ -127,11 +129,12 @@ def sharded(command: str) -> bool:
 
 
 def per_item() -> tuple[str, ...]:
-    """Stages whose items are images or pairs, as the first part of a run takes them."""
+    """Stages whose items are images or pairs, as the first part of a run takes them: without refine, which comes later
+    and is up to date as a whole."""
     return tuple(stage.name for stage in STAGES if stage.unit != "block" and stage.name != "refine")
 
 
-def maker(path: PurePosixPath) -> str:
+def stage_that_makes(path: PurePosixPath) -> str:
     """The stage that makes a file of a workspace, "" where none does. path: below the workspace."""
     if path.parts[0] == "reports":
         return path.name.partition(".")[0]
@@ -141,7 +144,7 @@ def maker(path: PurePosixPath) -> str:
 
 def makes(command: str, path: PurePosixPath) -> bool:
     """Whether a command makes a file of a workspace again where it is damaged."""
-    stage = maker(path)
+    stage = stage_that_makes(path)
     return command == "run" or stage in ("", "orient", "pairs", "enhance", "simulate", *COMMANDS.get(command, ()))
 
 

@@ -33,7 +33,8 @@ class Workspace:
     """Every path and file name below one root folder. Holds no state.
 
     step: the step of a cascade whose matches, verdicts and reports are meant, "" for those of the block. features_of:
-    the step whose pictures, views and features these are, "" for those of the block.
+    the step whose pictures, views and features these are, "" for those of the block. The step `guided` has none:
+    it uses those of `first`.
     """
 
     root: Path
@@ -264,12 +265,12 @@ def opened_workspace(root: Path, *, tables: bool = True) -> Workspace:
     block is not as it was written.
     """
     workspace = Workspace(root)
-    workspace.check_version()
     if not workspace.images.is_file():
         if workspace.orientation.is_dir():
             state = "holds no results yet (images.csv is missing): its run is estimating the orientation, or was ended"
             raise InputError(f"{root} {state} while it did; `aeromatch run` goes on with it")
         raise InputError(f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace")
+    workspace.check_version()
     if tables:
         workspace.check_tables()
     return workspace

@@ -18,10 +18,10 @@ from aeromatch_cli.formats.features import read_joined, read_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_verified_row
 from aeromatch_cli.geometry.coverage import CELLS, covered_share, shared_cells
 from aeromatch_cli.stages import extract, filter  # noqa: A004
-from aeromatch_cli.stages.cascade import _tried, _untied, keypoints_of, strategies_of
+from aeromatch_cli.stages.cascade import _not_tied_by_a_third, _with_few_partners, keypoints_of, strategies_of
+from aeromatch_cli.stages.joined_steps import joined_keypoints, joined_matches
 from aeromatch_cli.stages.pair_statistics import PairStatistics
 from aeromatch_cli.stages.shard import Shard
-from aeromatch_cli.stages.union import joined_keypoints, joined_matches
 from aeromatch_cli.strategies.extractors.described import Described
 from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows
 
@@ -74,12 +74,12 @@ def test_an_image_that_nothing_ties_is_tried_with_three_partners() -> None:
     }
     found[("c", "d")] = PairStatistics(700, 0.5, 0.9, MANY, 900)
     left = {key: "few" for key in found if key != ("c", "d")}
-    assert set(_tried(left, found)) == {("a", "b"), ("a", "x"), ("c", "x"), ("d", "x")}
+    assert set(_with_few_partners(left, found)) == {("a", "b"), ("a", "x"), ("c", "x"), ("d", "x")}
 
 
 def test_rare_pairs_go_without_features_where_a_third_image_ties_them() -> None:
     left = {("a", "c"): "few", ("c", "d"): "few"}
-    assert _untied(left, [("a", "b"), ("b", "c"), ("d", "e")]) == {("c", "d"): "few"}
+    assert _not_tied_by_a_third(left, [("a", "b"), ("b", "c"), ("d", "e")]) == {("c", "d"): "few"}
 
 
 @pytest.mark.parametrize(

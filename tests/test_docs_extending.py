@@ -26,6 +26,7 @@ from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.data import Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import output, scores, totals
+from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.results import stages as results
 from aeromatch_cli.store.block_store import BlockStore
@@ -141,8 +142,10 @@ def test_the_stage_writes_its_table_where_it_is_not_up_to_date(
         for pair, n in zip(pairs, (7, 0), strict=True)
     ]
     store = BlockStore(Workspace(tmp_path), Index())
-    context = SimpleNamespace(workspace=store.workspace, pairs=pairs, store=store, recorded=store.report)
-    state = SimpleNamespace(with_current_pairs=lambda: (context, []), inputs=lambda _: "some verdicts")
+    context = SimpleNamespace(
+        workspace=store.workspace, pairs=pairs, store=store, recorded=store.report, executor=Executor("serial", 1)
+    )
+    state = SimpleNamespace(with_current_pairs=lambda: (context, []), inputs_fingerprint=lambda _: "some verdicts")
     module.BlockState = SimpleNamespace(of=lambda _: state)
     declared = graph.Stage("connections", "block", module.ConnectionsResult)
     monkeypatch.setattr(graph, "BY_NAME", {**graph.BY_NAME, "connections": declared})
@@ -153,7 +156,7 @@ def test_the_stage_writes_its_table_where_it_is_not_up_to_date(
     assert (tmp_path / "connections.csv").read_text(encoding="utf-8").splitlines()[1:] == ["a,b,7"]
     (tmp_path / "connections.csv").unlink()
     assert module.run(context).done == 1
-    state.inputs = lambda _: "other verdicts"
+    state.inputs_fingerprint = lambda _: "other verdicts"
     assert module.run(context).done == 1
 
 

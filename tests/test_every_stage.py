@@ -23,7 +23,7 @@ ALONE = ("--executor", "serial", "--jobs", "1", *PAGE)
 def files_of(work: Path, stage: str) -> list[Path]:
     """The files that a stage has made, its report among them."""
     files = sorted(path for path in work.rglob("*") if path.is_file())
-    return [path for path in files if graph.maker(PurePosixPath(path.relative_to(work).as_posix())) == stage]
+    return [path for path in files if graph.stage_that_makes(PurePosixPath(path.relative_to(work).as_posix())) == stage]
 
 
 def damaged(path: Path, how: str) -> None:

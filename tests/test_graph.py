@@ -15,7 +15,7 @@ from conftest import UNORIENTED, Site, invoke
 
 from aeromatch_cli import graph
 from aeromatch_cli.cli import stage_commands
-from aeromatch_cli.stages import cascade, orient, pairs, run, union
+from aeromatch_cli.stages import cascade, joined_steps, orient, pairs, run
 
 # Reports, the list of failures and the lock are kept by all stages alike.
 BOOKKEEPING = ("reports/*", "failures.csv", "lost.csv", ".lock", "index.sqlite*", "*.tmp")
@@ -50,7 +50,7 @@ def test_the_diagram_of_the_documentation_shows_the_declarations() -> None:
 
 def test_every_command_of_a_stage_is_declared() -> None:
     """The command line states them once more, so that its help needs no types of results."""
-    assert stage_commands.STAGES.keys() == {*graph.COMMANDS, "check"}
+    assert stage_commands.COMMAND_HELP.keys() == {*graph.COMMANDS, "check"}
     assert {name for names in graph.COMMANDS.values() for name in names} <= set(run.FUNCTIONS)
     assert {*run.FUNCTIONS, "orient", "pairs"} == set(graph.ORDER)
 
@@ -69,7 +69,7 @@ def test_every_command_of_a_stage_is_declared() -> None:
     ],
 )
 def test_every_file_has_a_stage_that_makes_it(path: str, stage: str, commands: set[str]) -> None:
-    assert graph.maker(PurePosixPath(path)) == stage
+    assert graph.stage_that_makes(PurePosixPath(path)) == stage
     assert {name for name in graph.COMMANDS if graph.makes(name, PurePosixPath(path))} == commands
 
 
@@ -116,7 +116,12 @@ def opened(site: Site, monkeypatch: pytest.MonkeyPatch) -> Iterator[Opened]:
         monkeypatch.setitem(run.FUNCTIONS, stage, wrapped)
         monkeypatch.setattr(sys.modules[function.__module__], function.__name__, wrapped)
     # What decides which steps of a cascade a pair takes, and joins them, is a part of matching.
-    for module, name in ((cascade, "run"), (cascade, "plan"), (union, "run"), (union, "joined_context")):
+    for module, name in (
+        (cascade, "run"),
+        (cascade, "steps_on_file"),
+        (joined_steps, "run"),
+        (joined_steps, "joined_context"),
+    ):
         monkeypatch.setattr(module, name, found.during("match", getattr(module, name)))
     yield found
     found.listening = False

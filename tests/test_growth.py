@@ -27,7 +27,7 @@ def test_only_pairs_of_images_outside_are_guided(done_site: Site, matcher: str) 
     for pair in context.pairs:
         changed = pair in untied
         assert BlockState.of(grown).matcher(pair).guided is changed
-        assert (BlockState.of(grown).matches(pair) != BlockState.of(context).matches(pair)) is changed
+        assert (BlockState.of(grown).wanted_matches(pair) != BlockState.of(context).wanted_matches(pair)) is changed
 
 
 def test_a_matcher_without_guided_search_stays(done_site: Site) -> None:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
+from conftest import Site
 from make_results import filled
 
 from aeromatch_cli.cli.output import guarded
+from aeromatch_cli.errors import ItemError
+from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.results.stages import BlockResults
+from aeromatch_cli.stages import filter  # noqa: A004
 from aeromatch_cli.stages.command_result import Result
 from aeromatch_cli.stages.lost import lost_images, lost_lines, write_lost
 from aeromatch_cli.workspace import Workspace
@@ -53,3 +58,19 @@ def test_urgent_lines_are_said_once_on_the_right_stream(quiet: bool, capsys: pyt
     shown = capsys.readouterr()
     assert shown.out == ("" if quiet else "a summary\nresult    bad: so it is\n")
     assert shown.err == ("result    bad: so it is\n" if quiet else "")
+
+
+@pytest.mark.slow
+def test_an_image_whose_pairs_all_failed_is_sent_to_the_failures(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    judge = filter._judge
+
+    def broken(task: Any, pair: Any, entry: Any) -> Any:
+        if "first_pass" not in task.workspace.root.parts and "suburb_0003_jpg" in pair.geometry.pair.ids:
+            raise ItemError("on purpose")
+        return judge(task, pair, entry)
+
+    monkeypatch.setattr(filter, "_judge", broken)
+    assert site("run", "--executor", "serial").code == 1
+    (lost,) = read_csv(site.work / "lost.csv")
+    assert lost["image"] == "suburb_0003.jpg"
+    assert lost["reason"] == "none of its 4 pairs could be matched and verified: see failures.csv"

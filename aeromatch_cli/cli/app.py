@@ -17,7 +17,7 @@ from aeromatch_cli.cli.look_commands import EXAMPLES as LOOK_EXAMPLES
 from aeromatch_cli.cli.look_commands import LOOK
 from aeromatch_cli.cli.options import GroupedHelp
 from aeromatch_cli.cli.output import ARGUMENTS, as_epilog
-from aeromatch_cli.cli.stage_commands import STAGES, stage_command
+from aeromatch_cli.cli.stage_commands import COMMAND_HELP, stage_command
 from aeromatch_cli.errors import ConfigError
 
 
@@ -94,7 +94,7 @@ app = typer.Typer(
 weights_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="List, verify and add network weights.")
 app.add_typer(weights_app, name="weights")
 
-for _name, (_help, _examples) in STAGES.items():
+for _name, (_help, _examples) in COMMAND_HELP.items():
     app.command(_name, cls=GroupedHelp, help=_help, epilog=as_epilog(_examples))(stage_command(_name))
 for _name, _look in LOOK.items():
     app.command(_name, cls=GroupedHelp, epilog=as_epilog(LOOK_EXAMPLES[_name]))(_look)

@@ -249,12 +249,11 @@ Overwrite = Annotated[
     typer.Option("--overwrite", rich_help_panel=_RESULTS, help="Make every result again, even if it is up to date."),
 ]
 Deep = Annotated[
-    Path | None,
+    bool,
     typer.Option(
         "--deep",
-        metavar="WORK",
         rich_help_panel=_RESULTS,
-        help="Compare every file of a workspace with its checksum, in place of all other checks.",
+        help="Compare every file of a workspace with its checksum, in place of all other checks: check --deep WORK.",
     ),
 ]
 Strict = Annotated[

@@ -53,7 +53,7 @@ _WHOLE = ("run", "check")
 # Commands that end with a verdict on the block.
 _JUDGED = ("run", "adjust")
 # Name: what the command does, and examples.
-STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
+COMMAND_HELP: Mapping[str, tuple[str, Sequence[str]]] = {
     "run": (
         "Do everything, over all overlapping pairs: from the orientation to the report.",
         (
@@ -167,7 +167,7 @@ def stage_command(name: str) -> Callable[..., None]:
         executor: ExecutorName = None,
         scheduler: Scheduler = None,
         shard: ShardText = None,
-        deep: Deep = None,
+        deep: Deep = False,
         overwrite: Overwrite = False,
         strict: Strict = False,
         keep_images: KeepImages = False,
@@ -185,14 +185,14 @@ def stage_command(name: str) -> Callable[..., None]:
 
         def call() -> Result:
             from aeromatch_cli import graph
-            from aeromatch_cli.config import load
+            from aeromatch_cli.config import Settings, load
             from aeromatch_cli.stages import deep_check
             from aeromatch_cli.stages.run import execute
 
-            if deep is not None:
-                if config is not None or any(value is not None for value in block.values()):
-                    raise ConfigError("--deep looks at a workspace alone: leave out the preset and all of the block")
-                return deep_check.run(deep)
+            if deep:
+                if any(value is not None for value in block.values()):
+                    raise ConfigError("--deep looks at a workspace alone: leave out all that is said of the block")
+                return deep_check.run(Path(config or workspace or Settings.model_fields["workspace"].default))
             if strict and name not in _JUDGED:
                 raise ConfigError(f"--strict is for {' and '.join(_JUDGED)}: {name} does not say how good the block is")
             if scheduler and executor not in (None, "dask"):

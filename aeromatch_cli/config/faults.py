@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -58,6 +59,8 @@ def describe(fault: ErrorDetails, root: type[BaseModel], families: Families) -> 
         return f"{place or 'top level'}: {fault['msg'].removeprefix('Value error, ')}"
     phrase = _PHRASES.get(kind) or fault["msg"].replace("Input should", "must")
     hint = _whole_number(fault["input"]) if kind == "int_parsing" else ""
+    if kind == "literal_error":
+        hint = nearest(str(fault["input"]), re.findall(r"'([^']*)'", fault["ctx"]["expected"]), otherwise="")
     return f"{place or 'top level'}: {phrase} (got {_shown(fault['input'])}){hint}"
 
 

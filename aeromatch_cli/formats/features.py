@@ -81,14 +81,14 @@ def features_fingerprint(path: Path) -> str:
     return str(load_arrays(path, ("fingerprint",))["fingerprint"])
 
 
-def write_refined(stream: BinaryIO, keypoints_px: FloatArray, measured: BoolArray, fingerprint: str) -> None:
+def write_refined(stream: BinaryIO, keypoints_px: FloatArray, measured: BoolArray, features_fingerprint: str) -> None:
     """Write the refined places of the keypoints of an image.
 
     keypoints_px: (K, 2) of all keypoints. measured: (K,) which of them stand for their points or were measured by those
-    that do. fingerprint: of the features whose keypoints these are.
+    that do. features_fingerprint: of the features whose keypoints these are.
     """
     places = keypoints_px.astype(np.float32)
-    save_arrays(stream, fingerprint=np.array(fingerprint), keypoints_px=places, measured=measured)
+    save_arrays(stream, fingerprint=np.array(features_fingerprint), keypoints_px=places, measured=measured)
 
 
 def read_final_keypoints(features: Path, refined: Path) -> FloatArray:

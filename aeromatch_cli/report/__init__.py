@@ -3,6 +3,6 @@
 rows -> figures -> map, previews -> page (page.html.jinja)
 """
 
-from aeromatch_cli.report.page import is_of_earlier_results, kept, run
+from aeromatch_cli.report.page import is_of_earlier_results, page_if_up_to_date, run
 
-__all__ = ["is_of_earlier_results", "kept", "run"]
+__all__ = ["is_of_earlier_results", "page_if_up_to_date", "run"]

@@ -32,7 +32,7 @@ from aeromatch_cli.report.previews import DrawnMatches
 from aeromatch_cli.report.rows import NOT_JUDGED, ImageRow, PairRow
 from aeromatch_cli.report.stretches import made_of, stretches
 from aeromatch_cli.results.stages import Ninths
-from aeromatch_cli.stages.cascade import makers
+from aeromatch_cli.stages.cascade import feature_workspaces
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.store.matches import match_points
@@ -184,7 +184,7 @@ def _image_rows(
         if row.state == "verified":
             tied.update((row.image_id0, row.image_id1))
             matches.update({row.image_id0: row.verified, row.image_id1: row.verified})
-    images, made_in = [], makers(context.settings, context.workspace)
+    images, made_in = [], feature_workspaces(context.settings, context.workspace)
     for image in context.block.images:
         if image.image_id not in found.keypoints:
             points = _keypoints(context, image.image_id)

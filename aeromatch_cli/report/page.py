@@ -76,16 +76,16 @@ def run(context: Context) -> StageReport:
     with settled():
         page = render(context, found, adjustment)
     write_text(context.workspace.report, page)
-    report.vouches_for(context, (p for p in context.workspace.report.parent.rglob("*") if p.is_file()))
+    report.record_files(context, (p for p in context.workspace.report.parent.rglob("*") if p.is_file()))
     report.done = 1
     report.result = ReportResult(page="report/index.html", bytes=len(page.encode("utf-8")), of_results=results)
     return report.write(context.workspace)
 
 
-def kept(context: Context) -> StageReport | None:
+def page_if_up_to_date(context: Context) -> StageReport | None:
     """Return the report of the page on file, where everything that it tells of is as it was when it was written."""
     report = StageReport("report", items=1, fingerprint=_told_fingerprint(context.workspace))
-    return report if report.is_up_to_date(context) else None
+    return report if report.take_if_up_to_date(context) else None
 
 
 def is_of_earlier_results(workspace: Workspace) -> bool:

@@ -29,7 +29,7 @@ from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tile
 from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult
 from aeromatch_cli.sfm.quality.finding import Quality
-from aeromatch_cli.stages.cascade import makers
+from aeromatch_cli.stages.cascade import feature_workspaces
 from aeromatch_cli.stages.inspect_image import steps_of_image
 from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.stage_report import result_of, result_on_file
@@ -191,7 +191,7 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     lines.append(f"partners    {len(partners)}, {verified} of them verified")
     for partner in sorted(partners, key=lambda one: (-one.matches, one.name))[:_LISTED]:
         lines.append(f"            {partner.words}")
-    for made in makers(work.settings, workspace):
+    for made in feature_workspaces(work.settings, workspace):
         for what, path in (("enhanced", made.enhanced(image_id, ".png")), ("views", made.views(image_id))):
             if path.exists():
                 lines.append(f"{what:<11} {path}")

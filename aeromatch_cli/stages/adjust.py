@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, PoseResidual
+from aeromatch_cli.data import AdjustedBlock, Pair, PoseResidual
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.files import write_atomically, write_text
 from aeromatch_cli.fingerprints import fingerprint
@@ -46,9 +46,9 @@ def run(context: Context) -> StageReport:
         report.result = AdjustResult(images=0, remarks=[] if first_pass is None else [_NOTHING])
         _remove(context)
         return report.write(context.workspace)
-    context, _ = BlockState.of(context).with_current_pairs()
+    context, without_results = BlockState.of(context).with_current_pairs()
     report.fingerprint = _fingerprint(context)
-    if report.is_up_to_date(context):
+    if report.take_if_up_to_date(context):
         return report.write(context.workspace)
     _remove(context)
     try:
@@ -60,9 +60,9 @@ def run(context: Context) -> StageReport:
         report.result = AdjustResult(images=0, remarks=[f"not done: {error}"])  # not that of an earlier adjustment
         return report.write(context.workspace)
     residuals = _residuals(context, adjusted)
-    report.result = _result(context, adjusted, found, residuals)
+    report.result = _result(context, adjusted, found, residuals, without_results)
     report.done = report.items
-    report.vouches_for(context, _write(context, adjusted, residuals))
+    report.record_files(context, _write(context, adjusted, residuals))
     return report.write(context.workspace)
 
 
@@ -90,7 +90,7 @@ def _groups(context: Context) -> Sequence[Group]:
 
 def _is_current(context: Context, groups: Sequence[Group]) -> bool:
     made_now = context.with_scope(overwrite=False)
-    return bool(groups) and StageReport("adjust", fingerprint=_fingerprint(context)).is_up_to_date(made_now)
+    return bool(groups) and StageReport("adjust", fingerprint=_fingerprint(context)).take_if_up_to_date(made_now)
 
 
 def _fingerprint(context: Context) -> str:
@@ -105,13 +105,14 @@ def _fingerprint(context: Context) -> str:
         for part in (observed.focal_sigmas, observed.cameras, observed.angles, observed.flights, observed.velocities)
     ]
     how = VERSION, library_version("pycolmap"), context.settings.orient, context.settings.adjust.model_dump()
-    return fingerprint(how, BlockState.of(context).inputs("adjust"), sorted(poses.items()), known, control)
+    return fingerprint(how, BlockState.of(context).inputs_fingerprint("adjust"), sorted(poses.items()), known, control)
 
 
 def _remove(context: Context) -> None:
     folder = context.workspace.orientation
-    names = ("adjusted.npz", "orientation.csv", "residuals.csv", context.workspace.final.name)
+    names = ("adjusted.npz", "orientation.csv", "residuals.csv")
     context.workspace.forget("adjust", [folder / name for name in names])
+    context.workspace.forget("consistency", [context.workspace.final])  # which is of this adjustment
 
 
 def _residuals(context: Context, adjusted: AdjustedBlock) -> dict[str, PoseResidual]:
@@ -134,14 +135,16 @@ def _result(
     adjusted: AdjustedBlock,
     groups: Sequence[GroupResult],
     residuals: Mapping[str, PoseResidual],
+    without_results: Sequence[Pair],
 ) -> AdjustResult:
-    """Figures of the whole and of every group, and why images are not oriented."""
+    """Figures of the whole and of every group, and why images are not oriented. without_results: pairs that are not
+    matched and verified by the present settings."""
     control = control_of_block(context, adjusted, groups)
     return AdjustResult(
         **block_figures(adjusted, context.block.images, groups),
         positions_given=len(context.given.block.poses),
         reduced=_reduced(context),
-        outside=unregistered_reasons(context, adjusted),
+        outside=unregistered_reasons(context, adjusted, without_results),
         held_by=_held_by(context),
         readout_not_tried=readout_not_tried(context, adjusted.poses),
         control=control,

@@ -282,7 +282,7 @@ def _headers(pictures: Sequence[Path | RemoteFile], executor: Executor, index: I
         found[place], picture = outcome, pictures[place]
         if outcome.value is not None and isinstance(picture, Path):
             with suppress(OSError):
-                index.learn(what, picture.absolute(), kind.dump_python(outcome.value))
+                index.put(what, picture.absolute(), kind.dump_python(outcome.value))
     return [found[place] for place in range(len(pictures))]
 
 

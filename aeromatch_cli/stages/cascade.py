@@ -4,7 +4,7 @@ The stages extract, match and filter make each step; its files lie in folders of
 pair takes a further step where its verified matches are few for its overlap or leave parts of it empty, or where
 learned features may bring many more. Whether it does depends on this pair, and of steps whose features cost much and
 matches little on others of its images: a shard takes such pairs as far as it sees them, the command that ends the work
-of all shards the rest. `union` joins what the steps have found.
+of all shards the rest. `joined_steps` joins what the steps have found.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def _views(settings: Settings) -> NeighbourViews:
 
 
 # What a step changes of the settings.
-_RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = {
+_SETTINGS_OF: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = {
     GuidedSearch: lambda _, settings: {
         # The step has decided: guided search, however many matches there are.
         "match": settings.match.model_copy(update={"guided": True, "guide_below_matches": EVERY_PAIR}),
@@ -144,13 +144,14 @@ def run(context: Context) -> list[StepContext]:
     return done
 
 
-def plan(context: Context) -> list[StepContext]:
+def steps_on_file(context: Context) -> list[StepContext]:
     """Return the steps as far as they are on file."""
     return list(_steps(context))
 
 
 def _steps(context: Context) -> Iterator[StepContext]:
-    """Each step, with the pairs that the results on file of those before it leave to it."""
+    """Each step, with the pairs that the results on file of those before it leave to it. It is chosen when it is asked
+    for: by then the caller has made the one before."""
     settings = context.settings
     chosen = {(pair.image_id0, pair.image_id1): "" for pair in context.pairs}
     steps = [_step(context, FIRST, FIRST, settings.model_copy(update={"cascade": ()}), chosen)]
@@ -161,9 +162,11 @@ def _steps(context: Context) -> Iterator[StepContext]:
         reasons = {key: evidence.asks_for(recipe, most) for key, evidence in found.items()}
         left = {key: reason for key, reason in reasons.items() if reason and not found[key].shows_nothing}
         if recipe.own_features:
-            left = _tried(left, found)
+            left = _with_few_partners(left, found)
             if len(left) <= _RARE * len(reasons):
-                left = _untied(left, [key for key, evidence in found.items() if not evidence.lacks(recipe)])
+                left = _not_tied_by_a_third(
+                    left, [key for key, evidence in found.items() if not evidence.lacks(recipe)]
+                )
         if recipe.cheap_to_match:
             looked_at = {image_id for key in left for image_id in key}
             known = [key for key in reasons if key not in left and set(key) <= looked_at]
@@ -174,7 +177,7 @@ def _steps(context: Context) -> Iterator[StepContext]:
         yield steps[-1]
 
 
-def _tried(left: Mapping[Key, str], found: Mapping[Key, PairStatistics]) -> dict[Key, str]:
+def _with_few_partners(left: Mapping[Key, str], found: Mapping[Key, PairStatistics]) -> dict[Key, str]:
     """The pairs left without most of those of images that no step has tied to another."""
     tied = {image_id for key, evidence in found.items() if evidence.verified for image_id in key}
     pairs_of: dict[str, list[Key]] = {}
@@ -188,7 +191,7 @@ def _tried(left: Mapping[Key, str], found: Mapping[Key, PairStatistics]) -> dict
     return {key: reason for key, reason in left.items() if key not in dropped}
 
 
-def _untied(left: Mapping[Key, str], enough: Iterable[Key]) -> dict[Key, str]:
+def _not_tied_by_a_third(left: Mapping[Key, str], enough: Iterable[Key]) -> dict[Key, str]:
     """Return the pairs whose images no third image ties: none has pairs with both that have enough matches."""
     settled: dict[str, set[str]] = {}
     for id0, id1 in enough:
@@ -197,7 +200,7 @@ def _untied(left: Mapping[Key, str], enough: Iterable[Key]) -> dict[Key, str]:
     return {key: reason for key, reason in left.items() if not settled.get(key[0], set()) & settled.get(key[1], set())}
 
 
-def makers(settings: Settings, workspace: Workspace) -> list[Workspace]:
+def feature_workspaces(settings: Settings, workspace: Workspace) -> list[Workspace]:
     """Return the workspaces in which views and features are made: the workspace itself, or a cascade's first step and
     those with their own."""
     if not settings.cascade:
@@ -206,7 +209,7 @@ def makers(settings: Settings, workspace: Workspace) -> list[Workspace]:
     return [workspace.of_step(name, name) for name in names]
 
 
-def further(context: Context) -> list[StepContext]:
+def further_steps(context: Context) -> list[StepContext]:
     """Return the steps after the first, each with all pairs."""
     reasons = {(pair.image_id0, pair.image_id1): "" for pair in context.pairs}
     return [_further_step(context, recipe, reasons) for recipe in context.settings.cascade]
@@ -214,14 +217,14 @@ def further(context: Context) -> list[StepContext]:
 
 def strategies_of(step: Step, settings: Settings) -> dict[str, Strategy]:
     """Return, by family, the strategy that a step takes instead of the settings' own."""
-    return _RECIPES[type(step)](step, settings)
+    return _SETTINGS_OF[type(step)](step, settings)
 
 
 def _further_step(context: Context, recipe: Step, reasons: Mapping[Key, str]) -> StepContext:
     changed = {"cascade": (), **strategies_of(recipe, context.settings)}
     features_of = recipe.name if recipe.own_features else FIRST
     # A step with the first one's features goes on from its matches.
-    context = context.with_scope(searched_by=None if recipe.own_features else context.settings.match)
+    context = context.with_scope(continues=None if recipe.own_features else context.settings.match)
     return _step(context, recipe.name, features_of, context.settings.model_copy(update=changed), reasons)
 
 
@@ -237,7 +240,7 @@ def _step(context: Context, name: str, features_of: str, settings: Settings, rea
 
 def evidence_of(steps: Sequence[StepContext]) -> dict[Key, PairStatistics]:
     """Return, by pair, what the steps have found together, for the pairs that the last of their steps has judged."""
-    judged = [_InOrder(BlockState.of(step.context).verified_pairs()) for step in steps]
+    judged = [_InOrder(BlockState.of(step.context).judged_pairs()) for step in steps]
     readers = [_keypoint_reader(step) for step in steps]
     found = {}
     for pair in steps[0].context.pairs:

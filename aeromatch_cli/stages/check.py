@@ -241,7 +241,7 @@ def _explained(context: Context, first: Context, tried: Sequence[tuple[Pair, _Tr
 def _further_s(context: Context, sampled: Sequence[Pair]) -> float | None:
     """Seconds that the further steps of a cascade take where every pair needs them; None where that is unknown."""
     every_s = 0.0
-    for step in cascade.further(context):
+    for step in cascade.further_steps(context):
         tried = _try(step.context, sampled[0]) if sampled else None
         if tried is None:
             return None

@@ -50,17 +50,15 @@ def run(context: Context) -> StageReport:
         return report.write(context.workspace)
     report.items = len(context.pairs)
     report.fingerprint = fingerprint(
-        VERSION, recipe, BlockState.of(context).inputs("consistency"), bool(adjusted.poses)
+        VERSION, recipe, BlockState.of(context).inputs_fingerprint("consistency"), bool(adjusted.poses)
     )
-    if report.is_up_to_date(context):
+    if report.take_if_up_to_date(context):
         return report.write(context.workspace)
     context.workspace.forget("consistency", [context.workspace.final])
     with context.executor.step("consistency"):
         cameras = adjusted.cameras_of(context.block)
         entries = [
-            (pair, entry)
-            for pair, entry in BlockState.of(context).verified_pairs()
-            if entry.verdict.state == "verified"
+            (pair, entry) for pair, entry in BlockState.of(context).judged_pairs() if entry.verdict.state == "verified"
         ]
         keypoints_px = contents_of(context, adjusted).keypoints_px
         pairs = [_matched(context, adjusted, keypoints_px, pair.image_id0, entry) for pair, entry in entries]
@@ -78,7 +76,7 @@ def run(context: Context) -> StageReport:
     if block is not adjusted:
         write_atomically(context.workspace.final, lambda stream: write_adjusted(stream, block))
         files.append(context.workspace.final)
-    report.vouches_for(context, files)
+    report.record_files(context, files)
     left = _connection_left(context, entries)
     matches = sum(len(before.matches.indices) for _, before in entries)
     report.result = ConsistencyResult(
@@ -181,7 +179,7 @@ def _shown_ninths(context: Context) -> dict[str, BoolArray]:
 
 def final_pairs(context: Context, features: Callable[[str], str] | None = None) -> Judged:
     """Return judged pairs in the order of pairs.csv, without the matches that contradict the adjusted block. features:
-    as `verified_pairs` has them."""
+    as `judged_pairs` has them."""
     final = FinalEntries(context.workspace)
-    for pair, entry in BlockState.of(context).verified_pairs(features):
+    for pair, entry in BlockState.of(context).judged_pairs(features):
         yield pair, final.left(pair.image_id0, entry)  # of present keypoints: stale ones are none of those pairs

@@ -30,7 +30,7 @@ _Verified = Callable[[Context], Judged]
 def contents_of(
     context: Context,
     adjusted: AdjustedBlock | None = None,
-    verified: _Verified = lambda context: BlockState.of(context).verified_pairs(),
+    verified: _Verified = lambda context: BlockState.of(context).judged_pairs(),
     *,
     raw: bool = True,
 ) -> ExportContents:

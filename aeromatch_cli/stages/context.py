@@ -35,7 +35,7 @@ _GUESS = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Union:
+class JoinedFingerprints:
     """Holds the fingerprints that the features of every image and the matches of every pair of a cascade must carry, by
     id."""
 
@@ -76,16 +76,16 @@ class Scope:
     shard: the part of the block that it works on; None for all.
     overwrite: whether results that are up to date are made again.
     chosen: the pairs (image_id0, image_id1) that a step of a cascade works on; None for all.
-    searched_by: the matcher that made the matches which a step of a cascade continues from; None without such a step.
-    union: the fingerprints of features and matches that the steps of a cascade have made together; None without one.
+    continues: the matcher that made the matches which a step of a cascade continues from; None without such a step.
+    joined: the fingerprints of features and matches that the steps of a cascade have made together; None without one.
     part: a prefix to the names of stages where progress is shown.
     """
 
     shard: Shard | None = None
     overwrite: bool = False
     chosen: frozenset[tuple[str, str]] | None = None
-    searched_by: Matcher | None = None
-    union: Union | None = None
+    continues: Matcher | None = None
+    joined: JoinedFingerprints | None = None
     part: str = ""
 
 

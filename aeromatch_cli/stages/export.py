@@ -37,7 +37,9 @@ def run(context: Context) -> StageReport:
     context, outdated = BlockState.of(context).with_current_pairs()
     adjusted = final_block(context)
     given = sorted(context.given.block.poses.items()), sorted(context.guessed_cameras)
-    wanted = fingerprint(context.settings.export, BlockState.of(context).inputs("export"), given, adjusted is None)
+    wanted = fingerprint(
+        context.settings.export, BlockState.of(context).inputs_fingerprint("export"), given, adjusted is None
+    )
     report.items, report.fingerprint = len(context.settings.export), wanted
     folders = [context.workspace.export(exporter.name) for exporter in context.settings.export]
     record = context.recorded("export")
@@ -56,7 +58,7 @@ def run(context: Context) -> StageReport:
     alone = replace(context, executor=Executor("serial", 1, context.executor.progress))
     done = run_stage(alone, report, _run_task, tasks, names)
     report.result = ExportResult(exporters={one.name: one for one in done})
-    report.vouches_for(context, (context.workspace.export(one.name) / n for one in done for n in one.files))
+    report.record_files(context, (context.workspace.export(one.name) / n for one in done for n in one.files))
     report.failures += unexplained(context, outdated, "filter")
     return report.write(context.workspace)
 

@@ -66,8 +66,8 @@ def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
         matched, row = context.store.matches(image_id0), []
         for pair in pairs:
             on_file = matched.get(pair.image_id1)
-            if on_file and on_file.fingerprint == state.matches(pair) and features.issuperset(pair.ids):
-                made_of, seed = state.verdict(pair), state.seed(pair)
+            if on_file and on_file.fingerprint == state.wanted_matches(pair) and features.issuperset(pair.ids):
+                made_of, seed = state.wanted_verdict(pair), state.seed(pair)
                 row.append(PairTask(context.geometry(pair), made_of, on_file.features, seed))
             else:
                 missing.append(pair)

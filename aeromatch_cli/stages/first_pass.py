@@ -175,7 +175,7 @@ def count_pairs(context: Context, recipe: FirstPass) -> int:
 def verified_points(context: Context) -> Iterator[PairPoints]:
     """Yield verified matches of the first pass, stored pixels."""
     keypoints = {}
-    for pair, entry in BlockState.of(context).verified_pairs():
+    for pair, entry in BlockState.of(context).judged_pairs():
         if entry.verdict.state != "verified":
             continue
         for image_id in (pair.image_id0, pair.image_id1):

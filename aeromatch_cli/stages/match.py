@@ -60,7 +60,11 @@ def make_tasks(context: Context) -> list[MatchTask]:
     for image_id0, pairs in context.rows().items():
         usable = [p for p in pairs if p.image_id0 in features and p.image_id1 in features]
         row = tuple(
-            PairTask(context.geometry(p), state.matches(p), (state.features(p.image_id0), state.features(p.image_id1)))
+            PairTask(
+                context.geometry(p),
+                state.wanted_matches(p),
+                (state.wanted_features(p.image_id0), state.wanted_features(p.image_id1)),
+            )
             for p in usable
         )
         if row:
@@ -110,7 +114,20 @@ def _match_pair(
         matches = compared(matcher, _sides(task, pair, features0), pair.geometry, sources)
         for source in sources or ():
             check_unchanged(source)
+    _check(matcher, matches, _sides(task, pair, features0))
     return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches, pair.features)
+
+
+def _check(matcher: Matcher, matches: Matches, sides: tuple[Features, Features]) -> None:
+    """Raise ItemError where a matcher has returned what no later stage could use."""
+    count, keypoints = len(matches.indices), [len(side.keypoints_px) for side in sides]
+    lengths = {len(matches.scores), len(matches.view_pairs)}
+    if lengths != {count}:
+        words = f"{count} matches, but {len(matches.scores)} scores and {len(matches.view_pairs)} pairs of views"
+        raise ItemError(f"match={matcher.name} returned {words}: the matcher has a fault")
+    if count and not ((matches.indices >= -1) & (matches.indices < keypoints)).all():
+        words = f"keypoints that are not there (of {keypoints[0]} and {keypoints[1]})"
+        raise ItemError(f"match={matcher.name} returned {words}: the matcher has a fault")
 
 
 def _sides(task: MatchTask, pair: PairTask, features0: Features) -> tuple[Features, Features]:

@@ -108,7 +108,7 @@ def run(
         report.done = report.items
     else:
         report.skipped = report.items
-    report.vouches_for(context, _files(context, record))
+    report.record_files(context, _files(context, record))
     folder = context.workspace.orientation
     found = record.result
     ground, source, ground_remarks = judged_ground(context, _terrains(context, record), found)

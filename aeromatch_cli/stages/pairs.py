@@ -95,7 +95,7 @@ def prepare(
     warn(said_later)
     _check_pairs(context)
     if not dry:
-        report.vouches_for(context, _write(context, pairs_csv, quality))
+        report.record_files(context, _write(context, pairs_csv, quality))
         forget_absent(context)
         report.write(workspace)
     return context, oriented, report

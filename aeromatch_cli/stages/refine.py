@@ -58,7 +58,7 @@ def run(context: Context) -> StageReport:
         return report.write(context.workspace)
     context, _ = BlockState.of(context).with_current_pairs()
     report.items = len(context.block.images)
-    report.fingerprint = fingerprint(*_versions(), recipe, BlockState.of(context).inputs("refine"))
+    report.fingerprint = fingerprint(*_versions(), recipe, BlockState.of(context).inputs_fingerprint("refine"))
     if _is_up_to_date(context, report):
         return report.write(context.workspace)
     _make_room(context)
@@ -67,7 +67,7 @@ def run(context: Context) -> StageReport:
     found = _measured(context, table, recipe, report)
     report.result = _write(context, table, found, recipe)
     report.done = report.items - len(report.failures)
-    report.vouches_for(context, folder.glob("*.npz"))
+    report.record_files(context, folder.glob("*.npz"))
     return report.write(context.workspace)
 
 
@@ -147,7 +147,7 @@ class _Table:
         matches, scores = [], [np.zeros(0, np.float32)]
         used: dict[str, BoolArray] = {}
         places = _places(context)
-        for pair, entry in BlockState.of(context).verified_pairs():
+        for pair, entry in BlockState.of(context).judged_pairs():
             # Without both attitudes nobody knows how one image's surroundings look in the other.
             if entry.verdict.state == "verified" and _comparable(context.geometry(pair)):
                 ids = pair.image_id0, pair.image_id1

@@ -27,12 +27,12 @@ from aeromatch_cli.stages import (
     export,
     extract,
     filter,  # noqa: A004
+    joined_steps,
     match,
     pairs,
     picture_quality,
     refine,
     simulate,
-    union,
     up_to_date,
 )
 from aeromatch_cli.stages.command_result import (
@@ -245,13 +245,13 @@ def _cascaded(context: Context) -> tuple[Context, list[StageReport]]:
     steps = cascade.run(context)
     if context.scope.shard is not None:
         return context, [report for step in steps for report in step.reports]
-    joined = union.joined_context(context, steps)
-    return joined, union.run(joined, steps)
+    joined = joined_steps.joined_context(context, steps)
+    return joined, joined_steps.run(joined, steps)
 
 
 def _joined(context: Context) -> Context:
     """The context of the stages after a cascade, whose steps are on file."""
-    return union.joined_context(context, cascade.plan(context))
+    return joined_steps.joined_context(context, cascade.steps_on_file(context))
 
 
 def _run_all(context: Context) -> list[StageReport]:
@@ -284,7 +284,7 @@ def _without_keypoints(context: Context) -> str:
 
 
 def _page(context: Context) -> StageReport:
-    page = report.kept(context)
+    page = report.page_if_up_to_date(context)
     if page is None:
         with context.executor.step("report"):
             page = report.run(context)

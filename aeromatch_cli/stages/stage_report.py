@@ -83,12 +83,12 @@ class StageReport:
         told = old.failures, old.fingerprint, old.files, before
         return told == (self.failures, self.fingerprint, self.files, self.result)
 
-    def vouches_for(self, context: Context, paths: Iterable[Path]) -> None:
+    def record_files(self, context: Context, paths: Iterable[Path]) -> None:
         """State the files that the stage has written, as they are now."""
         root = context.workspace.root
         self.files = {path.relative_to(root).as_posix(): context.store.digest(path) for path in sorted(paths)}
 
-    def is_up_to_date(self, context: Context) -> bool:
+    def take_if_up_to_date(self, context: Context) -> bool:
         """Whether what a stage of the whole block has left is of this report's fingerprint, and as it was written. Then
         the report has its result, and all items are skipped."""
         record = context.recorded(self.stage)

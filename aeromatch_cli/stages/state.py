@@ -28,8 +28,8 @@ Judged = Iterator[tuple[Pair, VerifiedEntry]]
 
 @dataclass(frozen=True, eq=False)
 class BlockState:
-    """Images and pairs of a context, what they have on file, and whether that is up to date: it is where it carries the
-    fingerprint that `features`, `matches` or `verdict` gives. Every fingerprint is computed once."""
+    """Images and pairs of a context, what they have on file, and whether that is up to date: it is where it carries
+    the fingerprint that `wanted_features`, `wanted_matches` or `wanted_verdict` gives. Each is computed once."""
 
     context: Context
 
@@ -40,17 +40,17 @@ class BlockState:
 
     # --- what results must be made of --------------------------------------------------------------------------------
 
-    def features(self, image_id: str) -> str:
+    def wanted_features(self, image_id: str) -> str:
         """Return the fingerprint that the features of an image must carry."""
-        if self.context.scope.union is not None:
-            return self.context.scope.union.features.get(image_id, "")
+        if self.context.scope.joined is not None:
+            return self.context.scope.joined.features.get(image_id, "")
         return extract.task_of(self.context, image_id).fingerprint
 
-    def matches(self, pair: Pair) -> str:
+    def wanted_matches(self, pair: Pair) -> str:
         """Return the fingerprint that the matches of a pair must carry: of the matcher, both images' features, and
         their geometry."""
-        if self.context.scope.union is not None:
-            return self.context.scope.union.matches.get((pair.image_id0, pair.image_id1), "")
+        if self.context.scope.joined is not None:
+            return self.context.scope.joined.matches.get((pair.image_id0, pair.image_id1), "")
         return self.context.once("matches", *pair.ids, make=lambda: self._matches(pair))
 
     def _matches(self, pair: Pair) -> str:
@@ -63,7 +63,7 @@ class BlockState:
 
     def _how_matched(self, matcher: Matcher) -> tuple[str, ...]:
         """Return what the matches of all pairs of one matcher depend on, as canonical text."""
-        return canonical(matcher), canonical(self.context.scope.searched_by), canonical(library_version("poselib"))
+        return canonical(matcher), canonical(self.context.scope.continues), canonical(library_version("poselib"))
 
     def matcher(self, pair: Pair) -> Matcher:
         """Return the matcher of a pair: guided for an image that the first pass could not tie to the others."""
@@ -71,7 +71,7 @@ class BlockState:
         untied = self.context.block.outside & set(pair.ids)
         return chosen.model_copy(update={"guided": True}) if untied and isinstance(chosen, Search) else chosen
 
-    def verdict(self, pair: Pair) -> str:
+    def wanted_verdict(self, pair: Pair) -> str:
         """Return the fingerprint that the verdict on a pair must carry: of the chain, the matches, the geometry that
         the chain reads, and the seed."""
         return self.context.once("verdict", *pair.ids, make=lambda: self._verdict(pair))
@@ -79,7 +79,7 @@ class BlockState:
     def _verdict(self, pair: Pair) -> str:
         how, needs = self.context.once("verdict", make=self._how_judged)
         sides = [self.context.geometry_fingerprint(i, needs) for i in pair.ids]
-        return combined(*how, *map(canonical, (self.matches(pair), sides, self.seed(pair))))
+        return combined(*how, *map(canonical, (self.wanted_matches(pair), sides, self.seed(pair))))
 
     def _how_judged(self) -> tuple[tuple[str, ...], frozenset[str]]:
         """Return what the verdicts on all pairs depend on, as canonical text, and what the chain needs of the
@@ -92,7 +92,7 @@ class BlockState:
         """Return the random seed of a pair, which is the same whatever else is in the block."""
         return stable_hash(f"{self.context.settings.seed} {pair.image_id0} {pair.image_id1}") % (1 << 31)
 
-    def inputs(self, stage: str) -> str:
+    def inputs_fingerprint(self, stage: str) -> str:
         """Return the fingerprint of what a stage of the whole block is declared to read from the workspace.
 
         What stages make of images and pairs is told by the fingerprints that the verdicts of the pairs must carry, in
@@ -104,7 +104,7 @@ class BlockState:
         whole = [one.name for one in makers if one.unit == "block" or one.name == "refine"]
         parts: list[Any] = [(name, self._files(name)) for name in whole]
         if any(one.unit == "pair" for one in makers):
-            parts.append([(*pair.ids, self.verdict(pair)) for pair in self.context.pairs])
+            parts.append([(*pair.ids, self.wanted_verdict(pair)) for pair in self.context.pairs])
         return fingerprint(parts)
 
     def _files(self, stage: str) -> dict[str, str]:
@@ -117,12 +117,14 @@ class BlockState:
     def with_features(self, image_ids: Iterable[str]) -> set[str]:
         """Return those of the images whose features on file are up to date."""
         store = self.context.store
-        return {i for i in set(image_ids) if (known := store.features(i)) and known.fingerprint == self.features(i)}
+        return {
+            i for i in set(image_ids) if (known := store.features(i)) and known.fingerprint == self.wanted_features(i)
+        }
 
     def are_matched(self, pair: Pair) -> bool:
         """Whether the matches of a pair on file are up to date."""
         known = self.context.store.matches(pair.image_id0).get(pair.image_id1)
-        return known is not None and known.fingerprint == self.matches(pair)
+        return known is not None and known.fingerprint == self.wanted_matches(pair)
 
     def outdated_pairs(self) -> list[Pair]:
         """Return the pairs whose verdict, or the features that it points into, is not up to date."""
@@ -132,7 +134,11 @@ class BlockState:
             judged = self.context.store.verdicts(image_id0)
             for pair in pairs:
                 verdict = judged.get(pair.image_id1)
-                if verdict is None or verdict.fingerprint != self.verdict(pair) or not features.issuperset(pair.ids):
+                if (
+                    verdict is None
+                    or verdict.fingerprint != self.wanted_verdict(pair)
+                    or not features.issuperset(pair.ids)
+                ):
                     outdated.append(pair)
         return outdated
 
@@ -152,7 +158,7 @@ class BlockState:
         return replace(self.context, pairs=tuple(pairs)), outdated
 
     def known_verdicts(self) -> Iterator[tuple[Pair, KnownVerdict]]:
-        """Yield what is known of judged pairs, as `verified_pairs` has them, without their matches."""
+        """Yield what is known of judged pairs, as `judged_pairs` has them, without their matches."""
         store, row_id, row = self.context.store, "", dict[str, KnownVerdict]()
         features = cache(store.features_fingerprint)
         for pair in self.context.pairs:
@@ -162,7 +168,7 @@ class BlockState:
             if known is not None and not stale_image(pair.ids, known.features, features):
                 yield pair, known
 
-    def verified_pairs(self, features: Callable[[str], str] | None = None) -> Judged:
+    def judged_pairs(self, features: Callable[[str], str] | None = None) -> Judged:
         """Yield judged pairs in the order of pairs.csv: stale rows, of older pair lists or features that were made
         again since, cannot leak. features: fingerprint of an image's features, "" of none; by default that on file."""
         row_id, row = "", dict[str, VerifiedEntry]()

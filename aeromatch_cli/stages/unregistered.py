@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.data import AdjustedBlock, Pair
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.simulate import degenerate_view
@@ -17,15 +18,19 @@ from aeromatch_cli.stages.state import BlockState
 _FEW_KEYPOINTS = 0.1
 
 
-def unregistered_reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
-    """image_id -> why it is not oriented."""
+def unregistered_reasons(
+    context: Context, adjusted: AdjustedBlock, without_results: Sequence[Pair] = ()
+) -> dict[str, str]:
+    """image_id -> why it is not oriented. without_results: pairs beside those of the context, which are not verified
+    by the present settings."""
     outside = [i.image_id for i in context.block.images if i.image_id not in adjusted.poses]
     if not outside:
         return {}
-    pairs = Counter(i for p in context.pairs for i in (p.image_id0, p.image_id1))
+    pairs = Counter(image_id for pair in context.pairs for image_id in pair.ids)
+    failed = Counter(image_id for pair in without_results for image_id in pair.ids)
     verified: Counter[str] = Counter()
     tied: Counter[str] = Counter()
-    for pair, entry in BlockState.of(context).verified_pairs():
+    for pair, entry in BlockState.of(context).judged_pairs():
         if entry.verdict.state == "verified":
             ends = pair.image_id0, pair.image_id1
             verified.update(ends)
@@ -44,6 +49,8 @@ def unregistered_reasons(context: Context, adjusted: AdjustedBlock) -> dict[str,
         elif count <= _FEW_KEYPOINTS * usual:
             seen = degenerate_view(context.workspace, context.image_by_id[image_id]) or "no texture, or blurred"
             reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: {seen}"
+        elif not pairs[image_id] and failed[image_id]:
+            reasons[image_id] = f"none of its {failed[image_id]} pairs could be matched and verified: see failures.csv"
         elif not pairs[image_id]:
             reasons[image_id] = "in no pair: it overlaps no other image"
         elif not verified[image_id]:

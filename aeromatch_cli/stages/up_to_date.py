@@ -57,7 +57,7 @@ def unchanged_reports(workspace: Workspace, inputs: str) -> list[StageReport] | 
     if not inputs or not workspace.index.is_file():
         return None
     with closing(Index(workspace.index, read_only=True)) as index:
-        told = index.recalled(_FINISHED, _state(workspace, inputs))
+        told = index.get_state(_FINISHED, _state(workspace, inputs))
     try:
         return None if told is None else [_report(workspace, stage, **own) for stage, own in told.items()]
     except BrokenFileError:  # the long way makes it again
@@ -80,7 +80,7 @@ def remember(workspace: Workspace, index: Index, inputs: str, reports: Sequence[
     for one in reports:
         known = one.result is None or one.result == result_on_file(workspace, graph.BY_NAME[one.stage].result)
         told[one.stage] = {"items": one.items, "result": None if known or one.result is None else one.result.as_json()}
-    index.remember(_FINISHED, _state(workspace, inputs), told)
+    index.put_state(_FINISHED, _state(workspace, inputs), told)
 
 
 def _inputs(settings: Settings, root: Path) -> Iterator[Path | str]:

@@ -101,15 +101,15 @@ class BlockStore:
 
     def made_features(self, image_id: str, known: KnownFeatures) -> None:
         """Learn of features that a worker has written."""
-        self.index.learn(_FEATURES, self.workspace.features(image_id), known)
+        self.index.put(_FEATURES, self.workspace.features(image_id), known)
 
     def made_matches(self, image_id0: str, known: Mapping[str, KnownMatches]) -> None:
         """Learn of a row of matches that a worker has written."""
-        self.index.learn(_MATCHES, self.workspace.matches(image_id0), known)
+        self.index.put(_MATCHES, self.workspace.matches(image_id0), known)
 
     def made_verdicts(self, image_id0: str, known: Mapping[str, KnownVerdict]) -> None:
         """Learn of a row of verdicts that a worker has written."""
-        self.index.learn(_VERDICTS, self.workspace.verified(image_id0), known)
+        self.index.put(_VERDICTS, self.workspace.verified(image_id0), known)
 
     def record(self, path: Path) -> dict[str, Any]:
         """Return a record in JSON, where the files that it names beside it are as they were written; else nothing."""
@@ -133,11 +133,11 @@ class BlockStore:
 
     def digest(self, path: Path) -> str:
         """Return the SHA-256 of a file, which is read where it has changed since that was asked last."""
-        return str(self.index.known(_DIGEST, path, file_digest))
+        return str(self.index.read(_DIGEST, path, file_digest))
 
     def _known(self, what: str, path: Path, read: Callable[[Path], Any]) -> Any:
         try:
-            return self.index.known(what, path, read)
+            return self.index.read(what, path, read)
         except FileNotFoundError:
             return None
         except BrokenFileError as error:

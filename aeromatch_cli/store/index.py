@@ -47,7 +47,7 @@ class Index:
         self._new: dict[tuple[str, str], Row] = {}
         self._reader: sqlite3.Connection | None = None
 
-    def known(self, what: str, path: Path, read: Callable[[Path], Any]) -> Any:
+    def read(self, what: str, path: Path, read: Callable[[Path], Any]) -> Any:
         """Return what `read` finds in a file, without reading it where that is known.
 
         what: names the reader; raise its number, as in "features 2", when it finds something else in the same file.
@@ -72,15 +72,15 @@ class Index:
         self._found[key] = held
         return held[1]
 
-    def learn(self, what: str, path: Path, value: Any) -> None:
+    def put(self, what: str, path: Path, value: Any) -> None:
         """Keep what `read` would find in a file that has just been written, by the word of the worker that wrote it."""
         self._keep((what, self._name(path)), _status(path), value)
 
-    def remember(self, what: str, state: str, value: Any) -> None:
+    def put_state(self, what: str, state: str, value: Any) -> None:
         """Keep one value of the whole folder, which holds in a state that a digest tells."""
         self._keep((what, ""), state, value)
 
-    def recalled(self, what: str, state: str) -> Any | None:
+    def get_state(self, what: str, state: str) -> Any | None:
         """Return what was kept of the folder in this state; None where that is not known."""
         held = self._found.get((what, "")) or self._stored((what, ""))
         return held[1] if held is not None and held[0] == state else None

@@ -95,7 +95,7 @@ def rows_of(args: argparse.Namespace, block: Block) -> list[Row]:
 
 def _judged(work: Path) -> Iterator[Row]:
     context, *_ = pairs.prepare(load(str(work / "config.yaml")), Executor("serial", 1), dry=True)
-    steps = cascade.plan(context)
+    steps = cascade.steps_on_file(context)
     known = [cascade.evidence_of(steps[: k + 1]) for k in range(len(steps))]
     for step, recipe, before, after in zip(steps[1:], context.settings.cascade, known, known[1:], strict=False):
         for key, evidence in before.items():

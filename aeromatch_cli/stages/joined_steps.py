@@ -1,4 +1,4 @@
-"""union: one table of keypoints per image and one row of matches per pair, of all steps of a cascade.
+"""The steps of a cascade joined: one table of keypoints per image and one row of matches per pair.
 
 A keypoint of a later step that lies on one of an earlier step is that keypoint, so that tracks run through steps. Of
 matches that lie together in both images one stays: one that its own step has verified before others.
@@ -30,7 +30,7 @@ from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import ExtractResult, MatchResult
 from aeromatch_cli.stages import cascade, extract
 from aeromatch_cli.stages.cascade import StepContext
-from aeromatch_cli.stages.context import Context, Union
+from aeromatch_cli.stages.context import Context, JoinedFingerprints
 from aeromatch_cli.stages.driver import PairTask, RowResult, run_rows, run_stage
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, result_on_file
 from aeromatch_cli.stages.state import BlockState
@@ -82,9 +82,9 @@ def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
         for step in _matched(steps, pair):
             verdict = step.context.store.verdicts(key[0]).get(key[1])
             judged = None if verdict is None else verdict.fingerprint
-            found.append((step.name, BlockState.of(step.context).matches(pair), judged))
+            found.append((step.name, BlockState.of(step.context).wanted_matches(pair), judged))
         matches[key] = fingerprint(VERSION, found, features[key[0]], features[key[1]])
-    return context.with_scope(union=Union(features, matches))
+    return context.with_scope(joined=JoinedFingerprints(features, matches))
 
 
 def _usable(steps: Sequence[StepContext]) -> list[tuple[StepContext, set[str]]]:
@@ -100,18 +100,18 @@ def _matched(steps: Sequence[StepContext], pair: Pair) -> list[StepContext]:
         for step in steps
         if (id0, id1) in step.reasons
         and (known := step.context.store.matches(id0).get(id1)) is not None
-        and known.fingerprint == BlockState.of(step.context).matches(pair)
+        and known.fingerprint == BlockState.of(step.context).wanted_matches(pair)
     ]
 
 
 def run(context: Context, steps: Sequence[StepContext]) -> list[StageReport]:
-    """Write features and matches of the context's union, and steps.csv; the reports of extract and match."""
-    assert context.scope.union is not None
+    """Write the joined features and matches, and steps.csv; the reports of extract and match."""
+    assert context.scope.joined is not None
     return [_join_keypoints(context, steps), _join_matches(context, steps)]
 
 
 def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageReport:
-    assert context.scope.union is not None
+    assert context.scope.joined is not None
     report = StageReport("extract", items=len(context.block.images))
     _count_seconds(report, steps, ["extract"])
     report.failures = _failures(steps, "extract")
@@ -121,7 +121,7 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
         image_id = image.image_id
         own = [step for step, ready in usable if image_id in ready]
         joined += bool(own)
-        wanted = context.scope.union.features[image_id]
+        wanted = context.scope.joined.features[image_id]
         if own and (context.scope.overwrite or context.store.features_fingerprint(image_id) != wanted):
             paths = tuple((step.name, step.context.workspace.features(image_id)) for step in own)
             tasks.append(KeypointsTask(image_id, paths, context.workspace, wanted))
@@ -134,7 +134,7 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
         images_by_step={step.name: len(step.images) for step in steps if step.own_features},
         images_without_keypoints=0 if found is None else found.images_without_keypoints,
     )
-    report.fingerprint = fingerprint(sorted(context.scope.union.features.values()))
+    report.fingerprint = fingerprint(sorted(context.scope.joined.features.values()))
     return report.write(context.workspace)
 
 
@@ -214,7 +214,7 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
 
 def _join_tasks(context: Context, steps: Sequence[StepContext]) -> list[JoinTask]:
     """Return one task per row that has a pair with matches."""
-    assert context.scope.union is not None
+    assert context.scope.joined is not None
     tasks, ready = [], BlockState.of(context).with_features({image.image_id for image in context.block.images})
     for image_id0, pairs in context.rows().items():
         wanted, own = [], {}
@@ -223,8 +223,8 @@ def _join_tasks(context: Context, steps: Sequence[StepContext]) -> list[JoinTask
             # Of several steps with the same features the last one's matches count.
             known = {step.features_of: step.context.workspace for step in _matched(steps, pair)}
             if known and set(key) <= ready:
-                features = context.scope.union.features[key[0]], context.scope.union.features[key[1]]
-                wanted.append(PairTask(context.geometry(pair), context.scope.union.matches[key], features))
+                features = context.scope.joined.features[key[0]], context.scope.joined.features[key[1]]
+                wanted.append(PairTask(context.geometry(pair), context.scope.joined.matches[key], features))
                 own[key[1]] = tuple(known.items())
         if wanted:
             tasks.append(JoinTask(image_id0, tuple(wanted), own, context.workspace))
