@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from aeromatch_cli import __version__
 from aeromatch_cli.cli import app, output
-from aeromatch_cli.cli.stage_commands import STAGES
+from aeromatch_cli.cli.stage_commands import COMMAND_HELP
 from aeromatch_cli.stages.shard import Shard
 
 SETTINGS = UNORIENTED
@@ -55,9 +55,9 @@ def test_help_has_its_options_in_groups():
 def test_help_names_every_command_and_option():
     for arguments in ([], ["--help"]):
         text = CliRunner().invoke(app, arguments).output
-        for name in (*STAGES, "synth", "weights"):
+        for name in (*COMMAND_HELP, "synth", "weights"):
             assert re.search(rf"^\s+{name}\s", text, re.MULTILINE)
-    for name in STAGES:
+    for name in COMMAND_HELP:
         text = CliRunner().invoke(app, [name, "--help"]).output
         assert [option for option in OPTIONS if option not in text] == []
 

@@ -14,7 +14,7 @@ from read_pages import PAGES, ROOT, anchors, commands, inline_code, links, text_
 
 from aeromatch_cli.cli import app
 from aeromatch_cli.cli.look_commands import LOOK
-from aeromatch_cli.cli.stage_commands import STAGES
+from aeromatch_cli.cli.stage_commands import COMMAND_HELP
 from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.lab.synthetic.flight_plans import FLIGHTS
@@ -93,13 +93,13 @@ def understood(words: list[str], *, whole: bool) -> None:
         # In a sentence `aeromatch match` names the command, and `aeromatch match --shard 1/2` its option.
         if whole or type(error).__name__ != "MissingParameter":
             raise
-        if names[0] not in STAGES:
+        if names[0] not in COMMAND_HELP:
             return
         given = node.make_context(" ".join(names), ["PRESET", *words]).params
     if names[:1] == ["synth"]:
         assert given["preset"] in SCENES
         assert given["flight"] in FLIGHTS
-    elif names and names[0] in STAGES:
+    elif names and names[0] in COMMAND_HELP:
         valid_configuration(given)
 
 
@@ -162,7 +162,9 @@ def script_words(text: str) -> list[list[str]]:
     return [code.removeprefix("scripts/").split() for code in written if re.match(r"scripts/\w", code)]
 
 
-@pytest.mark.parametrize("name", [*STAGES, *LOOK, "evaluate", "synth", "weights list", "weights verify", "weights add"])
+@pytest.mark.parametrize(
+    "name", [*COMMAND_HELP, *LOOK, "evaluate", "synth", "weights list", "weights verify", "weights add"]
+)
 def test_help_shows_examples_that_are_understood(name: str) -> None:
     shown = invoke(*name.split(), "--help").stdout.partition("Examples:")[2]
     examples = [line.strip() for line in shown.splitlines() if line.strip()]
