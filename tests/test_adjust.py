@@ -445,3 +445,25 @@ def test_a_point_has_one_keypoint_in_each_image(truth: Truth) -> None:
     assert len(np.unique(track[:, 1])) == len(track) > 50
     for other in adjusted.tracks.values():
         assert len(np.unique(other[:, 1])) == len(other)
+
+
+def positions(site: Site) -> dict[str, FloatArray]:
+    """Adjusted projection centres, metres, by image."""
+    with (site.work / "orientation" / "orientation.csv").open(newline="") as stream:
+        return {row["image"]: np.array([float(row[key]) for key in "xyz"]) for row in csv.DictReader(stream)}
+
+
+@pytest.mark.slow
+def test_a_block_without_an_orientation_gets_one_from_its_verified_matches(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if the first pass had found too few matches to orient anything."""
+    assert site("run").facts["stages"]["adjust"]["result"]["images"] == IMAGES
+    before = positions(site)
+    monkeypatch.setattr(adjust, "_groups", lambda _: [])
+    again = site("adjust", "--overwrite", "--executor", "serial")
+    assert again.facts["stages"]["adjust"]["result"]["images"] == IMAGES
+    assert f"from the verified matches: {IMAGES} images, 0 from the first pass" in again.stdout
+    after = positions(site)
+    assert before.keys() == after.keys()
+    assert max(float(np.linalg.norm(after[name] - before[name])) for name in before) < 2.0

@@ -172,8 +172,7 @@ def test_points_in_one_place_or_on_one_line_determine_no_transformation(truth: T
         assert json.dumps(found.as_json(), allow_nan=False)
 
 
-def test_image_points_that_count_from_below_are_said(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control_stage.orient, "groups", lambda _: [])
+def test_image_points_that_count_from_below_are_said(truth: Truth) -> None:
     images = {image.image_id: image for image in truth.block.images}
 
     def said(points: list[ControlPoint]) -> list[str]:

@@ -20,7 +20,7 @@ from aeromatch_cli.results.stages import ConsistencyResult, FilterResult, Ninths
 from aeromatch_cli.sfm.outlier_rejection import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.sfm.track_pruning import without_dropped
 from aeromatch_cli.sfm.two_view_poses import placed_alone
-from aeromatch_cli.stages import adjust, orient
+from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import connection
@@ -36,7 +36,7 @@ def run(context: Context) -> StageReport:
     report = StageReport("consistency")
     recipe = context.settings.rejection
     adjusted = None
-    if recipe is not None and orient.groups(context):
+    if recipe is not None and context.workspace.adjusted.is_file():
         context, _ = BlockState.of(context).with_current_pairs()
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from aeromatch_cli.errors import InputError
+from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.results.stages import FurtherFirstPass
+from aeromatch_cli.sfm.earlier_datum import Before
 from aeromatch_cli.sfm.mapping import MAPPERS, Mapper, Model, map_block
 from aeromatch_cli.sfm.model_extension import grown
 from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES, only, sound_part
-from aeromatch_cli.sfm.solution import FirstPassMatches
+from aeromatch_cli.sfm.solution import FirstPassMatches, Solution, from_models
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
@@ -178,8 +180,22 @@ def _sound(context: Context, evidence: FirstPassMatches, model: Model) -> Model 
 def _mapped_images(context: Context, first: Context, mapper: Mapper, image_ids: set[str]) -> tuple[Model, ...]:
     """Models of the pairs of the first pass between some images. InputError where the mapper stops on a fault."""
     pairs = tuple(pair for pair in first.pairs if {pair.image_id0, pair.image_id1} <= image_ids)
-    with context.executor.step(f"first pass: {mapper} mapping of {len(image_ids)} images"):
+    what = "" if first.workspace == context.workspace else "first pass: "
+    with context.executor.step(f"{what}{mapper} mapping of {len(image_ids)} images"):
         return map_block(contents_of(replace(first, pairs=pairs)), context.observed, mapper)
+
+
+def remapped(context: Context) -> Solution | None:
+    """Return the orientation from the verified matches of the block, which are more than its first pass had; None where
+    they give none, or one in another frame."""
+    recipe, held = context.settings.first_pass, context.given.block
+    if recipe is None or not recipe.replaces or context.settings.match.reads_pixels:
+        return None
+    as_given = replace(context, block=replace(context.block, poses=held.poses))
+    pairs = list(first_pass.verified_points(context))
+    evidence = FirstPassMatches(as_given.block, pairs, thresholds_px(context), held.cameras)
+    found = _mapped(as_given, recipe, context, evidence)
+    return from_models(evidence, found.models, Before(), context.given.angles) if found.models else None
 
 
 def _images(models: Sequence[Model]) -> int:
@@ -206,5 +222,6 @@ def evidence_of(
 def thresholds_px(first: Context) -> dict[str, float]:
     """Return image_id -> error of an exact match of a first pass, stored pixels."""
     limit = first.settings.block.max_size_px
-    sizes = {image.image_id: max(image.width_px, image.height_px) for image in first.block.images}
-    return {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
+    return {
+        image.image_id: _EXACT_PX / scale_within(limit, image.width_px, image.height_px) for image in first.block.images
+    }

@@ -12,7 +12,6 @@ from aeromatch_cli.data import AdjustedBlock, ControlPoint
 from aeromatch_cli.results.adjustment import Control, GroupResult
 from aeromatch_cli.sfm.control import control_figures
 from aeromatch_cli.sfm.heights import shift_to_control_m, zeros_words
-from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.context import Context
 
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
@@ -66,8 +65,7 @@ def control_of_block(context: Context, adjusted: AdjustedBlock, groups: Sequence
 def _control_figures(context: Context, adjusted: AdjustedBlock, points: Sequence[ControlPoint]) -> Control:
     cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
     # Images that no position has placed lie beside the others: their rays meet those at no surveyed point.
-    beside = {i for group in orient.groups(context) if group.kind == "level" for i in group.images}
-    placed = {i: pose for i, pose in adjusted.poses.items() if i not in beside} or adjusted.poses
+    placed = {i: pose for i, pose in adjusted.poses.items() if i not in adjusted.frames} or adjusted.poses
     return control_figures(replace(adjusted, poses=placed), cameras, points, metric=context.block.metric)
 
 
