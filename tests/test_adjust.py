@@ -30,7 +30,7 @@ from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_k
 from aeromatch_cli.lab.synthetic import load_truth
 from aeromatch_cli.sfm import process
 from aeromatch_cli.sfm.mapping import Group, Observed, adjust_block, map_block
-from aeromatch_cli.stages import adjust
+from aeromatch_cli.stages import adjust, models
 from aeromatch_cli.strategies.exporters import Colmap, ExportContents
 
 zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
@@ -467,3 +467,19 @@ def test_a_block_without_an_orientation_gets_one_from_its_verified_matches(
     after = positions(site)
     assert before.keys() == after.keys()
     assert max(float(np.linalg.norm(after[name] - before[name])) for name in before) < 2.0
+
+
+@pytest.mark.slow
+def test_an_orientation_in_another_frame_is_not_taken(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its lengths are arbitrary, and the block's would be called metres."""
+    monkeypatch.setattr(adjust, "_groups", lambda _: [])
+    of_models = models.from_models
+    own = {"frame": "own"}
+    monkeypatch.setattr(
+        models,
+        "from_models",
+        lambda *args: replace(found := of_models(*args), result=found.result.model_copy(update=own)),
+    )
+    outcome = site("run", "--executor", "serial")
+    assert outcome.facts["stages"]["adjust"]["result"]["images"] == 0
+    assert not (site.work / "orientation" / "adjusted.npz").exists()

@@ -83,7 +83,7 @@ def _with_more_images(context: Context, groups: Sequence[Group]) -> tuple[Contex
     """Return the context and the groups of images with the orientation from the verified matches, where the first pass
     has left out images that these tie, and that has more of them.
 
-    Blocks that need it: every 4th image of lewis and of seneca.
+    A block that needs it: every 4th image of lewis, with positions from GPS.
     """
     oriented = _images(groups)
     tied = {i for pair, known in BlockState.of(context).known_verdicts() if known.state == "verified" for i in pair.ids}
@@ -102,7 +102,7 @@ def _images(groups: Sequence[Group]) -> set[str]:
 
 def adjusted_block(context: Context) -> AdjustedBlock | None:
     """Read the adjusted block of the present results; None without orientation, or where no image could be adjusted."""
-    if not _is_current(context):
+    if not context.workspace.adjusted.is_file() or not _is_current(context):
         return None
     found = read_adjusted(context.workspace.adjusted)
     return found if found.poses else None
@@ -125,8 +125,6 @@ def _groups(context: Context) -> Sequence[Group]:
 
 def _is_current(context: Context) -> bool:
     made_now = context.with_scope(overwrite=False)
-    if not context.workspace.adjusted.is_file():
-        return False
     return StageReport("adjust", fingerprint=_fingerprint(context)).take_if_up_to_date(made_now)
 
 

@@ -26,17 +26,17 @@ from aeromatch_cli.blocks.other_files import MASK
 from aeromatch_cli.blocks.read import BlockInputs, GivenHeights, block_inputs, read_lists
 from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, ControlPoint, FloatArray, Ground, Image
+from aeromatch_cli.data import Block, Ground, Image
 from aeromatch_cli.errors import BrokenFileError, ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor, Outcome
 from aeromatch_cli.files import read_json
 from aeromatch_cli.fingerprints import contents_digest, picture_fingerprint, program_digest
 from aeromatch_cli.formats.tables import read_picture_quality
-from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
 from aeromatch_cli.images.remote import RemoteFile, is_remote, list_remote, on_disk
 from aeromatch_cli.images.scaling import scale_within
+from aeromatch_cli.stages.context import Given
 from aeromatch_cli.stages.ground import given_ground, ground_fingerprint
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import FORMAT_VERSION, Workspace
@@ -51,26 +51,18 @@ _GSD_TOLERANCE = 0.1
 class BlockRead:
     """A block as it is given, with what was learnt on the way.
 
-    recognised, unread, flights, velocities: as in `read.BlockInputs`. urgent: warnings that are said even where quiet
+    recognised, unread: as in `read.BlockInputs`. urgent: warnings that are said even where quiet
     is asked for: of pictures that are not read, and of control points none of which is used. gsd_before_m: gsd_m and
     reduced_gsd_m that the workspace had, or None.
     ground_hint: the ground below relative altitudes, and its source.
     """
 
-    block: Block
-    image_fingerprints: Mapping[str, str]
-    focal_sigmas: Mapping[str, float]
-    likely_focals: Mapping[str, float]
-    angles: Mapping[str, Angles]
-    flights: Mapping[str, str]
-    velocities: Mapping[str, FloatArray]
-    control: tuple[ControlPoint, ...]
+    given: Given
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
     unread: tuple[tuple[str, str], ...]
     urgent: frozenset[str]
     recognised: str
-    remote: Mapping[str, RemoteFile]
     gsd_before_m: tuple[float | None, float | None]
     ground_hint: tuple[Ground, str] | None
 
@@ -106,14 +98,17 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor, ind
         gsd_m=None,
     )
     return BlockRead(
-        block=block,
-        image_fingerprints=prints,
-        focal_sigmas=inputs.focal_sigmas,
-        likely_focals=inputs.likely_focals,
-        angles=inputs.angles,
-        flights=inputs.flights,
-        velocities=inputs.velocities,
-        control=control,
+        given=Given(
+            block=block,
+            image_fingerprints=prints,
+            focal_sigmas=inputs.focal_sigmas,
+            likely_focals=inputs.likely_focals,
+            angles=inputs.angles,
+            flights=inputs.flights,
+            velocities=inputs.velocities,
+            control=control,
+            remote=remote,
+        ),
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
         unread=tuple((one.name, one.reason) for one in inputs.unread),
@@ -124,7 +119,6 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor, ind
             ]
         ),
         recognised=inputs.recognised,
-        remote=remote,
         gsd_before_m=(before.get("gsd_m"), before.get("reduced_gsd_m"))
         if before.get("ground_fingerprint") == ground_fingerprint(settings)
         else (None, None),

@@ -94,14 +94,7 @@ def _usable(steps: Sequence[StepContext]) -> list[tuple[StepContext, set[str]]]:
 
 def _matched(steps: Sequence[StepContext], pair: Pair) -> list[StepContext]:
     """Steps that have matches of a pair."""
-    id0, id1 = pair.image_id0, pair.image_id1
-    return [
-        step
-        for step in steps
-        if (id0, id1) in step.reasons
-        and (known := step.context.store.matches(id0).get(id1)) is not None
-        and known.fingerprint == BlockState.of(step.context).wanted_matches(pair)
-    ]
+    return [step for step in steps if pair.ids in step.reasons and BlockState.of(step.context).are_matched(pair)]
 
 
 def run(context: Context, steps: Sequence[StepContext]) -> list[StageReport]:

@@ -187,7 +187,7 @@ def _mapped_images(context: Context, first: Context, mapper: Mapper, image_ids: 
 
 def remapped(context: Context) -> Solution | None:
     """Return the orientation from the verified matches of the block, which are more than its first pass had; None where
-    they give none, or one in another frame."""
+    they give none, or one in another frame: what the block calls a metre, and its CRS, are those of its own."""
     recipe, held = context.settings.first_pass, context.given.block
     if recipe is None or not recipe.replaces or context.settings.match.reads_pixels:
         return None
@@ -195,7 +195,10 @@ def remapped(context: Context) -> Solution | None:
     pairs = list(first_pass.verified_points(context))
     evidence = FirstPassMatches(as_given.block, pairs, thresholds_px(context), held.cameras)
     found = _mapped(as_given, recipe, context, evidence)
-    return from_models(evidence, found.models, Before(), context.given.angles) if found.models else None
+    if not found.models:
+        return None
+    solution = from_models(evidence, found.models, Before(), context.given.angles)
+    return solution if (solution.result.frame == "world") == context.block.metric else None
 
 
 def _images(models: Sequence[Model]) -> int:

@@ -19,7 +19,7 @@ from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import OrientResult, PairsResult
 from aeromatch_cli.stages import orient, picture_quality
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
-from aeromatch_cli.stages.context import Context, Given, Scope
+from aeromatch_cli.stages.context import Context, Scope
 from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network
 from aeromatch_cli.stages.messages import orientation_lines
 from aeromatch_cli.stages.shard import Shard
@@ -55,15 +55,15 @@ def prepare(
     workspace = _opened(settings, dry=dry)
     index = index or Index()
     found = read_block(settings, workspace, executor, index)
-    as_given = summarise(found.block)
+    as_given = summarise(found.given.block)
     given_lines = [*([f"poses            {found.recognised}"] if found.recognised else []), *as_given.given_lines()]
     for line in given_lines:
         say(line)
-    known = [*found.warnings, *as_given.warnings, *_within_memory(settings, executor, found.block)]
+    known = [*found.warnings, *as_given.warnings, *_within_memory(settings, executor, found.given.block)]
     warn(known, found.urgent)
-    _check_images(found.block)
+    _check_images(found.given.block)
     for exporter in settings.export if exports else ():
-        exporter.check_images(found.block.images)
+        exporter.check_images(found.given.block.images)
     given = _context(settings, workspace, executor, index, found, shard, overwrite)
     quality = picture_quality.measured(given, dry=dry)
     looks = picture_quality.remarks(given, quality)
@@ -76,7 +76,7 @@ def prepare(
     pairs = _listed(context, report, anew=overwrite or dry)
     summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
     as_oriented = oriented.result if isinstance(oriented.result, OrientResult) else None
-    oriented_lines = [] if as_oriented is None else orientation_lines(as_oriented, found.block, context.block)
+    oriented_lines = [] if as_oriented is None else orientation_lines(as_oriented, found.given.block, context.block)
     remarks = [] if as_oriented is None else as_oriented.remarks
     said_later = [*remarks, *(w for w in summary.warnings if w not in known)]
     result = PairsResult(
@@ -85,7 +85,7 @@ def prepare(
         warnings=[*known, *said_later],
         urgent=sorted(found.urgent),
         unread=dict(found.unread),
-        images=len(found.block.images),
+        images=len(found.given.block.images),
     )
     report.result = result
     report.failures = list(found.failures)
@@ -179,18 +179,8 @@ def _context(
         settings=settings,
         workspace=workspace,
         executor=executor,
-        given=Given(
-            block=found.block,
-            image_fingerprints=found.image_fingerprints,
-            focal_sigmas=found.focal_sigmas,
-            likely_focals=found.likely_focals,
-            angles=found.angles,
-            flights=found.flights,
-            velocities=found.velocities,
-            control=found.control,
-            remote=found.remote,
-        ),
-        block=found.block,
+        given=found.given,
+        block=found.given.block,
         scope=Scope(shard=shard, overwrite=overwrite),
         index=index,
     )
