@@ -1,15 +1,14 @@
-"""How far the probability that a match is right can be relied on, on rendered blocks, by exact truth.
+"""Weights of the probability that a match is right, from rendered blocks with exact truth.
 
 Every block is one `aeromatch run auto` with its noisy poses. Of the verified matches, before any is dropped, that do
 not contradict the adjusted block (or, of images that it lacks, the geometry of their pair),
-`aeromatch_cli.sfm.probability` says how likely each is to be right:
-within 3 px of the exact place, which both images see. Stated: the mean of what it says; right: the share that is.
-Left: of the right ones, those that are stated to be at least as likely as asked (--least), and the share of right ones
-among all that are left.
+`aeromatch_cli.sfm.probability` says how likely each is to be right: within 3 px of the exact place, which both images
+see. The weights are found from the blocks of --fit and printed: WEIGHTS of that module are those of
 
---fit SEEDS renders other blocks of the same scenes and flights, finds the weights from these alone, and prints them:
-WEIGHTS of that module are those of the command that docs/results/auto.md shows. Writes OUT/probability.md and
-OUT/reliability.svg. What OUT has is not made again.
+    scripts/train probability --flights mixed,oblique --fit 931,943 --seed 917 --out DIR
+
+Blocks of --seed, which no weight saw, say how far they hold: by stated probability, the share that is right. What OUT
+has is not made again.
 """
 
 from __future__ import annotations
@@ -21,8 +20,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from benchmarks import options
+from benchmarks.processes import limit_threads
+from benchmarks.scenes import NOISY_POSES, render_asked
+from benchmarks.tables import markdown, percent
+from benchmarks.whole import whole_run
 
-from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
+from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray
 from aeromatch_cli.evaluate.scores import CORRECT_PX
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.features import read_final_keypoints
@@ -35,15 +39,8 @@ from aeromatch_cli.sfm.probability import WEIGHTS, columns, fitted_weights, stat
 from aeromatch_cli.sfm.two_view_poses import placed_alone
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace
-from benchmarks import options, stamps
-from benchmarks.pages import FOLDER
-from benchmarks.processes import limit_threads
-from benchmarks.scenes import NOISY_POSES, render_asked
-from benchmarks.tables import markdown, number, percent
-from benchmarks.whole import whole_run
 
 _EDGES = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 1.0)
-_SIZE_IN = (5.0, 4.6)
 
 Block = tuple[str, FloatArray, BoolArray]
 
@@ -120,67 +117,16 @@ def together(blocks: Sequence[Block]) -> tuple[FloatArray, BoolArray]:
     return np.concatenate([values for _, values, _ in blocks]), np.concatenate([right for _, _, right in blocks])
 
 
-def _classes(p: FloatArray) -> IntArray:
-    """(M,) number of the class of each probability."""
-    return np.digitize(p, _EDGES[1:-1])
-
-
-def table_of(blocks: Sequence[Block], least: float) -> str:
-    """Blocks, and classes of probability."""
-    lines = []
-    for name, values, right in [*blocks, ("all", *together(blocks))]:
-        p = stated(values)
-        left = p >= least
-        lines.append(
-            [name, number(len(right)), percent(p.mean(), 1), percent(right.mean(), 1),
-             percent(right[left].sum() / right.sum(), 1), percent(p[left].mean(), 1), percent(right[left].mean(), 1)]
-        )  # fmt: skip
-    all_values, all_right = together(blocks)
-    all_p = stated(all_values)
-    number_of, classes = _classes(all_p), []
-    for k, (low, high) in enumerate(pairwise(_EDGES)):
-        own = number_of == k
-        if own.any():
-            classes.append(
-                [f"{low:g} to {high:g}", number(int(own.sum())), percent(all_p[own].mean(), 1),
-                 percent(all_right[own].mean(), 1)]
-            )  # fmt: skip
-    titles = ["block", "matches", "stated", "right", f"right ones left at {least:g}"]
-    titles += ["stated of these", "right of these"]
-    return "\n\n".join(
-        [
-            "#### By block\n\n" + markdown(titles, lines),
-            "#### By stated probability\n\n" + markdown(["probability", "matches", "stated", "right"], classes),
-        ]
-    )
-
-
-def draw_reliability(path: Path, blocks: Sequence[Block]) -> None:
-    """Write an SVG: of every class of stated probability, the share that is right, block by block and together."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    matplotlib.rcParams["svg.hashsalt"] = "reliability"
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=_SIZE_IN)
-    axis.plot([0, 1], [0, 1], color="#999999", linewidth=0.8)
-    for name, values, right in (*blocks, ("all", *together(blocks))):
-        p = stated(values)
-        classes = _classes(p)
-        shown = [k for k in range(len(_EDGES) - 1) if (classes == k).sum() >= 30]
-        means = [(p[classes == k].mean(), right[classes == k].mean()) for k in shown]
-        style = {"color": "#1f6f3f", "linewidth": 2.0} if name == "all" else {"color": "#b0c8b8", "linewidth": 0.8}
-        axis.plot(*zip(*means, strict=True), marker="o", markersize=3, **style)
-    axis.set_xlabel("stated probability")
-    axis.set_ylabel("share that is right")
-    axis.set_xlim(0, 1)
-    axis.set_ylim(0, 1)
-    axis.set_aspect("equal")
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+def table_of(values: FloatArray, right: BoolArray) -> str:
+    """A line for every class of stated probability."""
+    p = stated(values)
+    number_of = np.digitize(p, _EDGES[1:-1])
+    lines = [
+        [f"{low:g} to {high:g}", int(own.sum()), percent(p[own].mean(), 1), percent(right[own].mean(), 1)]
+        for k, (low, high) in enumerate(pairwise(_EDGES))
+        if (own := number_of == k).any()
+    ]
+    return markdown(["probability", "matches", "stated", "right"], lines)
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -189,19 +135,13 @@ def main(arguments: Sequence[str]) -> None:
     options.add_rendered(parser, scenes=",".join(PRESETS), size="640x480", images=7, flights="nadir,mixed")
     add("--fit", type=options.numbers, help="seeds of the blocks from which the weights are found, comma-separated")
     add("--keypoints", type=options.positive, default=2048, help="descriptors per image, of every step of the cascade")
-    add("--least", type=float, default=0.8, help="least probability of the matches that are left")
     add("--jobs", type=options.positive, default=2)
-    options.add_output(parser)
+    add("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
     args = options.parse(parser, arguments, {"scenes": "suburb", "flights": "nadir", "size": "480x360"})
+    if args.fit and args.seed in args.fit:
+        parser.error(f"--fit holds {args.seed}, the seed of the blocks that are judged: give others")
     limit_threads(2)
     if args.fit:
         weights = fitted_weights(*together(list(blocks_of(args, args.fit))))
         print("WEIGHTS =", tuple(round(float(weight), 3) for weight in weights))
-    blocks = list(blocks_of(args, [args.seed]))
-    draw_reliability(args.out / "reliability.svg", blocks)
-    if args.docs is not None:
-        draw_reliability(FOLDER / "reliability.svg", blocks)
-    options.publish(
-        args, table_of(blocks, args.least) + "\n", args.out / "probability.md", table="bench_probability",
-        command=options.command_line(parser, args), versions=stamps.of_chain("auto"),
-    )  # fmt: skip
+    print(table_of(*together(list(blocks_of(args, [args.seed])))))
