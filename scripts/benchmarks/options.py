@@ -11,7 +11,7 @@ from typing import Any
 from aeromatch_cli.files import write_text
 from aeromatch_cli.lab.synthetic import PRESETS
 from aeromatch_cli.lab.synthetic.flight_plans import FLIGHTS
-from benchmarks.pages import FOLDER, PAGES, write_table
+from benchmarks.pages import every_table, write_table
 from benchmarks.stamps import Version, make_stamp
 
 
@@ -72,7 +72,7 @@ def add_output(parser: argparse.ArgumentParser, tables: int = 1) -> None:
     about = "write into docs/results"
     if tables == 1:
         about += "; TABLE: another table than the benchmark's own"
-        parser.add_argument("--docs", choices=("", *PAGES), nargs="?", const="", metavar="TABLE", help=about)
+        parser.add_argument("--docs", choices=("", *every_table()), nargs="?", const="", metavar="TABLE", help=about)
     else:
         parser.add_argument("--docs", action="store_const", const="", help=about)
     parser.add_argument("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
@@ -130,4 +130,4 @@ def publish(
     print(text)
     if args.docs is not None:
         name = args.docs or table
-        write_table(FOLDER / PAGES[name], name, page_text or text, make_stamp(command, versions))
+        write_table(name, page_text or text, make_stamp(command, versions))
