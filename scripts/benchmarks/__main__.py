@@ -27,10 +27,6 @@ TABLE: Table = {
         "benchmarks.robustness.command",
         "whether a verdict can be believed: blocks spoilt in known ways, and good ones, by exact truth",
     ),
-    "polar": ("benchmarks.polar.command", "registration of texture-poor ground beside SIFT"),
-    "keypoints": ("benchmarks.keypoints.command", "detectors, angles and descriptors of one place, by exact truth"),
-    "filters": ("benchmarks.filters", "filters on the same matches, by exact truth"),
-    "shadow": ("benchmarks.shadow", "masks of `enhance=shadow` against rendered truth and hand labels"),
     "picture": ("benchmarks.picture", "the README's picture: one hard pair, SIFT beside a preset, by exact truth"),
     "same": ("benchmarks.same", "whether two workspaces hold the same verified matches, array by array"),
 }

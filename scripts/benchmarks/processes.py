@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import resource
-import statistics
 import subprocess
 import threading
 import time
@@ -69,25 +68,6 @@ def peak_mb() -> float:
     if _STATUS.is_file():
         return int(_STATUS.read_text(encoding="ascii", errors="replace").partition("VmHWM:")[2].split()[0]) / 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def median_seconds(call: Callable[[], Any], runs: int, device: str = "cpu") -> tuple[float, Any]:
-    """Median of some calls after the first, and what it returned. device: where they work; "cuda" is waited for."""
-
-    def finished() -> Any:
-        value = call()
-        if device == "cuda":
-            import torch
-
-            torch.cuda.synchronize()
-        return value
-
-    value, seconds = finished(), []
-    for _ in range(runs):
-        started = time.perf_counter()
-        finished()
-        seconds.append(time.perf_counter() - started)
-    return statistics.median(seconds), value
 
 
 def run_watched(command: Sequence[str], log: Path) -> tuple[int, float, float]:

@@ -69,11 +69,6 @@ def total(rows: Iterable[Row], field: str) -> float:
     return math.fsum(values(rows, field))
 
 
-def mean(rows: Iterable[Row], field: str) -> float:
-    """Over the rows that have a figure, NaN without any."""
-    return float(np.mean(found)) if (found := values(rows, field)) else math.nan
-
-
 def median(rows: Iterable[Row], field: str) -> float:
     """Over the rows that have a figure, NaN without any."""
     return float(np.median(found)) if (found := values(rows, field)) else math.nan

@@ -11,9 +11,9 @@ from pathlib import Path
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.files import read_json, write_json
 from benchmarks.auto.blocks import Block
-from benchmarks.methods.worker import measure
 from benchmarks.peers.base import Options
 from benchmarks.peers.table import NEED_WEIGHTS, PEERS, reads_poses
+from benchmarks.peers.worker import measure
 from benchmarks.scenes import NOISY_POSES, Judged, with_noisy_poses
 from benchmarks.sources import OUR_CODE, code_digest
 from benchmarks.tables import Row, plain

@@ -26,9 +26,9 @@ import numpy as np
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
 from benchmarks import options, stamps
-from benchmarks.methods.worker import measure
 from benchmarks.peers.base import Options
 from benchmarks.peers.table import NEED_WEIGHTS, PEERS, Named, check_method, named_methods, settings_of
+from benchmarks.peers.worker import measure
 from benchmarks.processes import limit_threads
 from benchmarks.scenes import Judged, Selection, real, rendered_scenes
 from benchmarks.tables import (
