@@ -33,11 +33,13 @@ def bench(out: Path, *methods: str) -> int:
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_LOG_LEVEL"):
             patched.setenv(name, os.environ.get(name, ""))  # as they were, afterwards
         patched.setattr(scenes, "render_once", partial(scenes.render_once, jobs=1))
-        return __main__.main(["peers", *quick, "--seed", "1", "--out", str(out), "--methods", ",".join(methods)])
+        return __main__.main(
+            ["peers", "rendered", *quick, "--seed", "1", "--out", str(out), "--methods", ",".join(methods)]
+        )
 
 
 def rows_of(out: Path) -> list[Row]:
-    rows: list[Row] = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    rows: list[Row] = json.loads((out / "rendered.json").read_text(encoding="utf-8"))
     return rows
 
 

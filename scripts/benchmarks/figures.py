@@ -47,6 +47,10 @@ def _auto(column: str, method: str) -> Figure:
     return Figure("bench_auto", column, {"condition": "all", "method": f"`{method}`"})
 
 
+def _steep(column: str, method: str) -> Figure:
+    return Figure("bench_peers_rendered", column, {"view angle": ">60", "method": f"`{method}`"})
+
+
 RESULTS: Sequence[Result] = (
     Result(
         "Rendered blocks of two seeds, poses off by 3 degrees and 5 % of the flying height: one sun, two suns, two "
@@ -67,12 +71,14 @@ RESULTS: Sequence[Result] = (
         "`oblique` has {own} correct matches a pair, {right} right; {aliked} x ALIKED on the images as taken, {ground} "
         "x ALIKED on this project's ground views",
         {
-            "own": Figure("bench_peers", "correct", {"view angle": ">60", "method": "`oblique`"}),
-            "right": Figure("bench_peers", "right", {"view angle": ">60", "method": "`oblique`"}),
-            "aliked": Figure("bench_peers", "`oblique` / it", {"view angle": ">60", "method": "`aliked`"}),
-            "ground": Figure("bench_peers", "`oblique` / it", {"view angle": ">60", "method": "`aliked@ground`"}),
+            "own": _steep("correct", "oblique"),
+            "right": _steep("right", "oblique"),
+            "aliked": _steep("`oblique` / it", "aliked"),
+            "ground": Figure(
+                "bench_peers_rendered", "`oblique` / it", {"view angle": ">60", "method": "`aliked@ground`"}
+            ),
         },
-        "scripts/bench peers",
+        "scripts/bench peers rendered",
     ),
     Result(
         "Simulated blocks of 24 images with real lenses of which EXIF tells the focal length alone",

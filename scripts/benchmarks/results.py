@@ -7,7 +7,6 @@ has a folder for each state of aeromatch_cli. A benchmark that fails does not ke
 
 from __future__ import annotations
 
-import re
 import shlex
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from benchmarks.stamps import REPOSITORY
 @dataclass(frozen=True)
 class Standing:
     """A page of docs/results. minutes: planned, on two idle cores. runs: the text of commands after `scripts/bench`, in
-    which DATA, WEIGHTS and OUT stand for folders."""
+    which DATA and WEIGHTS stand for folders."""
 
     page: str
     minutes: int
@@ -32,53 +31,28 @@ class Standing:
 
 
 STANDING: Mapping[str, Standing] = {
-    "auto": Standing(
-        "auto.md",
-        45,
-        (
-            "auto rendered --docs --out OUT/auto",
-            "auto strategies --docs --out OUT/auto",
-            "auto real --data DATA --docs --out OUT/auto",
-        ),
-    ),
-    "claims": Standing(
-        "claims.md",
-        20,
-        ("claims --seed 1 --data DATA --reference-weights WEIGHTS --docs --out OUT/claims",),
-    ),
+    "auto": Standing("auto.md", 45, ("auto rendered", "auto strategies", "auto real --data DATA")),
+    "claims": Standing("claims.md", 20, ("claims --seed 1 --data DATA --reference-weights WEIGHTS",)),
     "peers": Standing(
         "peers.md",
         15,
-        (
-            "peers --reference-weights WEIGHTS --docs --out OUT/peers",
-            "peers --scenes '' --data DATA --blocks lewis,ochota --reference-weights WEIGHTS --docs bench_peers_real "
-            "--out OUT/peers-real",
-        ),
+        ("peers rendered --reference-weights WEIGHTS", "peers real --data DATA --reference-weights WEIGHTS"),
     ),
-    "calibration": Standing("calibration.md", 10, ("calibration --docs --out OUT/calibration",)),
-    "orientation": Standing(
-        "orientation.md",
-        10,
-        (
-            "orientation --data DATA --blocks seneca,ochota,lewis --thin 2 --cases reference,noise,nothing,third "
-            "--keypoints 3000 --docs --out OUT/orientation",
-            "orientation --blocks city:nadir,grass:nadir,hills:nadir,suburb:mixed --rendered 12 --size 800x600 "
-            "--cases reference,noise,noisy,unoriented --keypoints 2000 --docs bench_orientation_rendered "
-            "--out OUT/orientation",
-        ),
-    ),
-    "growth": Standing("growth.md", 6, ("growth --docs --out OUT/growth",)),
-    "speed": Standing("speed.md", 10, ("speed --docs --out OUT/speed",)),
-    "robustness": Standing("robustness.md", 4, ("robustness --docs --out OUT/robustness",)),
+    "calibration": Standing("calibration.md", 10, ("calibration",)),
+    "orientation": Standing("orientation.md", 10, ("orientation real --data DATA", "orientation rendered")),
+    "growth": Standing("growth.md", 6, ("growth",)),
+    "speed": Standing("speed.md", 10, ("speed",)),
+    "robustness": Standing("robustness.md", 4, ("robustness",)),
 }
 
 
-def words(run: str, given: Mapping[str, str], *, docs: bool, quick: bool = False) -> list[str]:
-    """Arguments of `scripts/bench` for one run; without weights their option is left out."""
-    text = run if docs else re.sub(r" --docs( bench_\S+)?", "", run)
-    text = text if "WEIGHTS" in given else re.sub(r" --reference-weights WEIGHTS", "", text)
-    found = [re.sub(r"^(DATA|WEIGHTS|OUT)\b", lambda match: given[match[0]], word) for word in shlex.split(text)]
-    return [*found, *(["--quick"] if quick else [])]
+def words(run: str, given: Mapping[str, str], *, docs: bool = False, quick: bool = False) -> list[str]:
+    """Arguments of `scripts/bench` for one run. Without weights their option is left out; every benchmark has a folder of
+    its name in OUT."""
+    text = run if "WEIGHTS" in given else run.removesuffix(" --reference-weights WEIGHTS")
+    found = [given.get(word, word) for word in shlex.split(text)]
+    found += ["--out", str(Path(given["OUT"]) / found[0])]
+    return [*found, *(["--docs"] if docs else []), *(["--quick"] if quick else [])]
 
 
 def main(arguments: Sequence[str]) -> int:

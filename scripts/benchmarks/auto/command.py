@@ -117,10 +117,8 @@ def _real(arguments: Sequence[str]) -> None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    first = options.make_parser("auto", __doc__)
-    first.add_argument("section", choices=("rendered", "strategies", "real"))
-    section = first.parse_args(arguments[:1]).section
+    section, rest = options.section_of("auto", __doc__, ("rendered", "strategies", "real"), arguments)
     if section == "real":
-        _real(arguments[1:])
+        _real(rest)
     else:
-        _rendered(section, arguments[1:])
+        _rendered(section, rest)

@@ -1,7 +1,7 @@
 """Orientation from the pictures: reference poses made worse, what `aeromatch run` finds then, beside the references.
 
-DATA holds blocks as BLOCK/images and BLOCK/reference/{poses.csv,block.json}; SCENE:FLIGHT is rendered, with exact
-truth and a camera file. Every case is one run of the preset on every k-th image (--thin):
+Sections: real, of DATA/BLOCK/images and DATA/BLOCK/reference/{poses.csv,block.json}; rendered, of SCENE:FLIGHT, with
+exact truth and a camera file. Every case is one run of the preset on every k-th image (--thin):
 
   reference  the reference poses and camera as they are: what the others are measured against
   noisy      noise in all poses, 5 % of the flying height in each coordinate and 3 degrees in each angle
@@ -69,7 +69,7 @@ def run_case(args: Any, block: str, every: int, case: str) -> Row:
     if not run.answer:
         return row | {"seconds": run.seconds, "said": [run.said[-300:]]}
     stages = run.answer["stages"]
-    facts = evaluated(work, reference, mapping=args.mapping)
+    facts = evaluated(work, reference, mapping=False)
     found = judged(work, reference, names, wrong)
     row |= {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in found.items()}
     if case == "level":  # heights count from the flight
@@ -78,10 +78,8 @@ def run_case(args: Any, block: str, every: int, case: str) -> Row:
     row |= {"pairs": stages["filter"]["result"]["pairs"].get("verified", 0), "seconds": run.seconds}
     row |= {"stages": {name: stage["seconds"] for name, stage in stages.items()}}
     row |= {"unregistered": sorted(stages["adjust"]["result"].get("outside", names))}
-    row |= {"registered": facts["consumer"].get("registered")}
     write_json(answer, row)
-    if not args.keep:
-        shutil.rmtree(work)
+    shutil.rmtree(work)
     return row
 
 
@@ -172,33 +170,51 @@ def table_of(rows: Sequence[Row]) -> str:
     return markdown(["block", "case", *(title for title, _ in shown)], lines)
 
 
+# What a section does where an option is not given, and with --quick.
+_DEFAULTS = {
+    "real": {"blocks": "seneca,ochota,lewis", "thin": "2", "cases": "reference,noise,nothing,third", "keypoints": 3000},
+    "rendered": {
+        "blocks": "city:nadir,grass:nadir,hills:nadir,suburb:mixed", "thin": "1",
+        "cases": "reference,noise,noisy,unoriented", "keypoints": 2000,
+    },
+}  # fmt: skip
+_QUICK = {
+    "real": {"blocks": "seneca", "thin": "5", "cases": "reference,nothing", "keypoints": 1000},
+    "rendered": {"blocks": "grass:nadir", "rendered": 5, "size": "400x300", "cases": "reference,noise"},
+}
+
+
 def main(arguments: Sequence[str]) -> None:
-    parser = options.make_parser("orientation", __doc__)
+    section, rest = options.section_of("orientation", __doc__, tuple(_DEFAULTS), arguments)
+    parser = options.make_parser(f"orientation {section}", __doc__)
     add = parser.add_argument
-    add("--data", type=Path, default=Path(), metavar="DIR", help="folder of blocks")
-    add("--blocks", type=options.names, default="lewis,seneca", help="names or SCENE:FLIGHT, comma-separated")
-    add("--rendered", type=options.positive, default=24, help="images of a rendered block")
-    add("--size", type=options.size_px, metavar="WxH", default="1600x1200", help="of rendered images")
-    add("--seed", type=int, default=0, help="of rendered blocks")
-    add("--thin", type=options.numbers, default="1", help="keep every k-th image; several k comma-separated")
-    add("--cases", type=options.names, default=",".join(CASES), help="comma-separated")
+    if section == "real":
+        add("--data", type=Path, required=True, metavar="DIR", help="folder of blocks")
+        add("--blocks", type=options.names, help="names, comma-separated")
+    else:
+        add("--blocks", type=options.names, help="SCENE:FLIGHT, comma-separated")
+        add("--rendered", type=options.positive, default=12, help="images of a block")
+        add("--size", type=options.size_px, metavar="WxH", default="800x600", help="of images")
+        add("--seed", type=int, default=0)
+    add("--thin", type=options.numbers, help="keep every k-th image; several k comma-separated")
+    add("--cases", type=options.names, help=f"comma-separated, of {', '.join(CASES)}")
     add("--preset", default="baseline", help="preset of every run")
-    add("--keypoints", type=options.positive, default=4000, help="descriptors per image")
+    add("--keypoints", type=options.positive, help="descriptors per image")
     add("--set", type=options.names, default="", metavar="KEY=VALUE", help="settings of every run, comma-separated")
     add("--jobs", type=options.positive, default=2)
-    add("--mapping", action="store_true", help="also map every result with pycolmap")
     add("--again", action="store_true", help="run what was run before")
-    add("--keep", action="store_true", help="keep the workspaces")
     options.add_output(parser)
-    args = options.parse(parser, arguments, {"keypoints": 1000})
+    parser.set_defaults(**_DEFAULTS[section])
+    args = options.parse(parser, rest, _QUICK[section])
+    if unknown := sorted(set(args.cases) - set(CASES)):
+        parser.error(f"--cases: {', '.join(unknown)} are none of {', '.join(CASES)}")
     rows = []
-    if args.data == Path() and any(":" not in block for block in args.blocks):
-        parser.error("blocks without a flight are folders: give --data DIR, or SCENE:FLIGHT to render")
     for row in rows_of(args):
         rows.append(row)
         print(json.dumps(row), file=sys.stderr, flush=True)
+    shown = {"size": "{}x{}".format(*args.size)} if section == "rendered" else {}
     options.publish(
-        args, table_of(rows) + "\n", args.out / "orientation.md", table="bench_orientation",
-        command=options.command_line(parser, args, size="{}x{}".format(*args.size)),
+        args, table_of(rows) + "\n", args.out / f"{section}.md", table=f"bench_orientation_{section}",
+        command=options.command_line(parser, args, **shown),
         versions=stamps.of_chain(f"{args.preset}[{','.join(args.set)}]" if args.set else args.preset),
     )  # fmt: skip

@@ -2,9 +2,9 @@
 
 A method is a peer or a preset, with settings in brackets as in `--set`, and a label before it where the name gets long:
 'opencv-sift,plain=fusion[enhance=none]'. Peers that are networks take part where --reference-weights has their weights.
-Rendered scenes (one block of each of --flights) are judged by their exact geometry, real blocks (DATA/BLOCK/images,
-DATA/BLOCK/reference) by the epipolar lines of their reference poses. All have exact poses; pairs overlap by a fifth at
-least, a quarter of each class of view angle where a scene has as many.
+Sections: rendered, scenes (one block of each of --flights) that are judged by their exact geometry; real, blocks
+(DATA/BLOCK/images, DATA/BLOCK/reference) that are judged by the epipolar lines of their reference poses. All have exact
+poses; pairs overlap by a fifth at least, a quarter of each class of view angle where a scene has as many.
 
 Correct: matches a pair within 3 px, after thinning them one-to-one to 2 px. Right: of the kept ones. Recall: of the
 keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. First / it:
@@ -59,8 +59,9 @@ _FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 def asked_scenes(args: argparse.Namespace) -> Iterator[Judged]:
     """One after the other, each made when it is needed."""
-    yield from (judged for _, judged in rendered_scenes(args, "angles"))
-    for block in args.blocks:
+    if "scenes" in args:
+        yield from (judged for _, judged in rendered_scenes(args, "angles"))
+    for block in args.blocks if "blocks" in args else ():
         selection = Selection("angles", args.pairs, args.seed)
         yield real(args.out / "scenes", args.data, block, selection, max_size_px=args.max_size)
 
@@ -132,20 +133,26 @@ def with_weights(methods: Sequence[Named], weights: Path | None) -> list[Named]:
 
 
 def main(arguments: Sequence[str]) -> None:
-    parser = options.make_parser("peers", __doc__)
+    section, rest = options.section_of("peers", __doc__, ("rendered", "real"), arguments)
+    parser = options.make_parser(f"peers {section}", __doc__)
     add = parser.add_argument
     add("--methods", default=METHODS, help=f"comma-separated: {', '.join(PEERS)}, or presets")
-    options.add_rendered(parser, scenes="city,suburb,hills", pairs=8, size="800x600", images=12, flights="oblique")
+    quick: dict[str, object] = {"pairs": 3, "keypoints": 512}
+    if section == "rendered":
+        scenes = "city,suburb,hills"
+        options.add_rendered(parser, scenes=scenes, pairs=8, size="800x600", images=12, flights="oblique")
+        quick |= {"scenes": "suburb", "size": "480x360", "images": 10}
+    else:
+        add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
+        add("--blocks", type=options.names, default="lewis,ochota", help="names, comma-separated")
+        add("--pairs", type=options.positive, default=8, help="of each block")
+        add("--max-size", type=options.positive, default=1000, help="longer side of images, px")
+        add("--seed", type=int, default=0, help="another seed gives other pairs")
+        quick |= {"blocks": "lewis", "max_size": 500}
     add("--keypoints", type=options.positive, default=2048, help="descriptors per image, exactly")
     add("--reference-weights", type=Path, metavar="DIR", help=f"weights of {', '.join(NEED_WEIGHTS)}")
-    add("--data", type=Path, metavar="DIR", help="folder of real blocks")
-    add("--blocks", type=options.names, default="", help="names of real blocks, comma-separated")
-    add("--max-size", type=options.positive, default=1000, help="longer side of real images, px")
     options.add_output(parser)
-    quick = {"scenes": "suburb", "pairs": 3, "size": "480x360", "images": 5, "keypoints": 512}
-    args = options.parse(parser, arguments, quick)
-    if args.blocks and args.data is None:
-        parser.error("--blocks needs --data: the folder that holds BLOCK/images and BLOCK/reference")
+    args = options.parse(parser, rest, quick)
     limit_threads(THREADS)
     methods = named_methods(args.methods)
     for name in methods:
@@ -154,10 +161,10 @@ def main(arguments: Sequence[str]) -> None:
     rows: list[Row] = []
     for row in rows_of(args, methods):
         rows.append(row)
-        write_rows(args.out / "results.json", rows)
+        write_rows(args.out / f"{section}.json", rows)
     if not rows:
         raise ConfigError("no scene has a pair that overlaps: give another --seed")
     options.publish(
-        args, table_of(rows) + "\n", args.out / "peers.md", table="bench_peers",
+        args, table_of(rows) + "\n", args.out / f"{section}.md", table=f"bench_peers_{section}",
         command=options.command_line(parser, args), versions=stamps.of_matching(*settings_of(methods)),
     )  # fmt: skip
