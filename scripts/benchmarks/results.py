@@ -47,8 +47,8 @@ STANDING: Mapping[str, Standing] = {
 
 
 def words(run: str, given: Mapping[str, str], *, docs: bool = False, quick: bool = False) -> list[str]:
-    """Arguments of `scripts/bench` for one run. Without weights their option is left out; every benchmark has a folder of
-    its name in OUT."""
+    """Arguments of `scripts/bench` for one run. Without weights their option is left out; every benchmark has a folder
+    of its name in OUT."""
     text = run if "WEIGHTS" in given else run.removesuffix(" --reference-weights WEIGHTS")
     found = [given.get(word, word) for word in shlex.split(text)]
     found += ["--out", str(Path(given["OUT"]) / found[0])]
