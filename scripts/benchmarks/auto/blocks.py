@@ -20,9 +20,9 @@ _GAMMA = 2.2
 _EVERY_PAIR = 1_000_000
 # Condition -> SCENE:FLIGHT of its blocks; a block may be of several.
 CONDITIONS: Mapping[str, tuple[str, ...]] = {
-    "one sun": ("suburb:nadir", "hills:nadir"),
+    "one sun": ("suburb:nadir", "city:nadir"),
     "two suns": ("city:mixed", "suburb:two-flights"),
-    "two exposures": ("suburb:exposed", "city:exposed"),
+    "two exposures": (f"suburb:{EXPOSED}", f"city:{EXPOSED}"),
     "five cameras": ("city:oblique", "suburb:oblique"),
     "texture-poor": ("grass:nadir", "desert:nadir", "farmland:nadir"),
     "rows and facades": ("farmland:nadir", "city:nadir", "city:oblique"),

@@ -40,8 +40,7 @@ from benchmarks.tables import Row, write_rows
 METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
 STRATEGIES = (
     "filter=epipolar+graph,filter=clustered-ransac+epipolar,"
-    "auto[extract.colours=true,filter=colour+clustered-ransac+epipolar],consistency.min_probability=0.5,"
-    "simulate=neighbours,cascade=guided"
+    "consistency.min_probability=0.5,simulate=neighbours,cascade=guided"
 )
 
 
@@ -49,7 +48,12 @@ def _rendered(section: str, arguments: Sequence[str]) -> None:
     parser = options.make_parser(f"auto {section}", __doc__)
     add = parser.add_argument
     add("--places", type=options.names, default=",".join(PLACES), metavar="SCENE:FLIGHT", help="comma-separated")
-    add("--seeds", type=options.numbers, default="1,2", help="of the blocks, comma-separated")
+    add(
+        "--seeds",
+        type=options.numbers,
+        default="1,2" if section == "rendered" else "1",
+        help="of the blocks, comma-separated",
+    )
     add("--size", metavar="WxH", default="640x480", help="of rendered images")
     add("--images", type=options.positive, default=6, help="of each rendered block, twice as many of five cameras")
     about = "SIFT descriptors per image; networks have half as many"
@@ -58,7 +62,7 @@ def _rendered(section: str, arguments: Sequence[str]) -> None:
         add("--methods", type=split_methods, default=METHODS, help=f"presets, and of {', '.join(PEERS)}")
     else:
         add("--strategies", type=split_methods, default=STRATEGIES, help="settings of auto, comma-separated")
-    add("--jobs", type=options.positive, default=2)
+    add("--jobs", type=options.positive, default=2, help="methods at a time, on one core each")
     add("--reference-weights", type=Path, metavar="DIR", help="weights of peers that are networks")
     options.add_output(parser)
     quick = {"places": "suburb:nadir,suburb:exposed", "seeds": "1", "size": "320x240", "images": 4, "keypoints": 1000}
@@ -70,7 +74,7 @@ def _rendered(section: str, arguments: Sequence[str]) -> None:
         parser.error(f"--methods must hold {JUDGED}, which the others are compared with")
     for method in methods:
         check_method(method)
-    limit_threads(2)
+    limit_threads(1)
     rows: list[Row] = []
     for own in rendered.measured(args, methods):
         rows += own

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 
@@ -33,11 +35,11 @@ HEADS = (
 
 
 def measured(args: argparse.Namespace, methods: Sequence[str]) -> Iterator[list[Row]]:
-    """Rows of every method on every block that it is asked for."""
-    for block, judged in asked_blocks(args):
-        for method in methods:
-            if block.nadir or parse_method(method)[0] != NADIR_ONLY:
-                yield rows_of(args, block, judged, method)
+    """Rows of every method on every block that it is asked for; --jobs methods run at a time, on one core each."""
+    with ThreadPoolExecutor(args.jobs) as pool:
+        for block, judged in asked_blocks(args):
+            asked = [name for name in methods if block.nadir or parse_method(name)[0] != NADIR_ONLY]
+            yield from pool.map(partial(rows_of, args, block, judged), asked)
 
 
 def by_block(rows: Sequence[Row]) -> Mapping[str, list[Row]]:

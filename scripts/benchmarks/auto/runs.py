@@ -7,6 +7,7 @@ import csv
 import re
 import shutil
 from pathlib import Path
+from threading import Lock
 
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.files import read_json, write_json
@@ -20,6 +21,8 @@ from benchmarks.tables import Row, plain
 from benchmarks.whole import budget_settings, evaluated, whole_run
 
 JUDGED = "auto"
+# Several settings of auto, which run at a time, start from one workspace.
+_making = Lock()
 _FIGURES = ("kept", "correct", "median_error_px")
 
 
@@ -28,7 +31,7 @@ def rows_of(args: argparse.Namespace, block: Block, judged: Judged, method: str)
     peer = method in PEERS
     folder = args.out / "runs" / block.slug / re.sub(r"[^a-z0-9.]+", "-", method.lower()).strip("-")
     path = folder / "rows.json"
-    asked = {"method": method, "size": args.size, "images": args.images, "keypoints": args.keypoints}
+    asked = {"method": method, "block": judged.key, "keypoints": args.keypoints}
     asked |= {} if peer else {"code": code_digest(*OUR_CODE)}
     known = read_json(path) if path.is_file() else {}
     if known.get("asked") != asked:
@@ -48,9 +51,10 @@ def _preset_rows(args: argparse.Namespace, block: Block, judged: Judged, method:
     settings = [*budget_settings(load(preset, own), args.keypoints), *own, "run.report=false"]
     start = None
     if preset == JUDGED and own:
-        rows_of(args, block, judged, JUDGED)
+        with _making:
+            rows_of(args, block, judged, JUDGED)
         start = folder.with_name(JUDGED) / "work"
-    run = whole_run("run", preset, scene.images, work, extra=given, jobs=args.jobs, settings=settings, start=start)
+    run = whole_run("run", preset, scene.images, work, extra=given, jobs=1, settings=settings, start=start)
     if not run.answer:
         raise SystemExit(f"aeromatch run {method} on {block.name} failed with exit code {run.code}:\n{run.said}")
     evaluated(work, scene.images.parent, mapping=False)
@@ -66,7 +70,7 @@ def _preset_rows(args: argparse.Namespace, block: Block, judged: Judged, method:
 def _peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
     """Every judged pair in turn; features of an image count once."""
     most = args.keypoints // 2 if peer in NEED_WEIGHTS else args.keypoints
-    limits = Options(most, "image", args.jobs, 0, args.reference_weights)
+    limits = Options(most, "image", 1, 0, args.reference_weights)
     noisy = with_noisy_poses(judged) if reads_poses(peer) else None
     rows: list[Row] = []
     known: set[str] = set()
