@@ -13,11 +13,8 @@ and principal point: errors of the median camera. Error / stated: of projection 
 deviations. Verdicts: how many blocks were called good, doubtful and bad.
 
 Peers: colmap: incremental mapping, SIMPLE_RADIAL, principal point in the middle; colmap-opencv: its model adjusted once
-more as OPENCV with a free principal point; colmap-priors: and so with the given positions as observations. Models are
-put into the world by the positions.
+more as OPENCV with a free principal point. Models are put into the world by the positions.
 
-Start mapped: what `map_block` finds; perturbed: exact poses made worse by 0.5 degrees and 1 % of the flying height,
-neighbours nearly alike.
 Writes OUT/rows/CASE.json for every case, OUT/results.json and OUT/calibration.md; rows that OUT has are not made again.
 """
 
@@ -41,8 +38,8 @@ from aeromatch_cli.sfm.quality.judgement import judged as verdict
 from aeromatch_cli.stages import adjust, orient
 from benchmarks import options, stamps
 from benchmarks.calibration.accuracy import Found, judged
-from benchmarks.calibration.colmap import PEERS, WITH_POSITIONS, mapped_by_colmap
-from benchmarks.calibration.simulate import FLIGHTS, POSITIONS, mapped, perturbed, simulate
+from benchmarks.calibration.colmap import PEERS, mapped_by_colmap
+from benchmarks.calibration.simulate import FLIGHTS, POSITIONS, mapped, simulate
 from benchmarks.calibration.verdict import of_adjusted
 from benchmarks.processes import fresh_process, limit_threads
 from benchmarks.tables import (
@@ -63,14 +60,13 @@ _OURS = "aeromatch"
 
 
 class Case(NamedTuple):
-    """One simulated block. start: how poses are known before the adjustment."""
+    """One simulated block."""
 
     scene: str
     flight: str
     images: int
     positions: str
     seed: int
-    start: str
     tie_points: int
 
 
@@ -89,7 +85,7 @@ def _run(case: Case, method: str, path: Path) -> None:
     began = time.perf_counter()
     try:
         if method == _OURS:
-            contents, groups = perturbed(block) if case.start == "perturbed" else mapped(block)
+            contents, groups = mapped(block)
             adjusted, facts = adjust_block(contents, block.observed, groups, fixed=False)
             found: Found | None = Found.of(adjusted)
             evidence = of_adjusted(contents, block.observed, adjusted, facts, metric=case.positions != "nothing")
@@ -118,16 +114,10 @@ def rows_of(args: Any) -> Iterator[Row]:
     """All rows, the missing ones made first: cases of one scene and seed in one process, which builds it once."""
     axes = product(args.scenes, args.seeds, args.flights, args.images, args.positions)
     cases = [
-        Case(scene, flight, images, positions, seed, args.start, args.points)
-        for scene, seed, flight, images, positions in axes
+        Case(scene, flight, images, positions, seed, args.points) for scene, seed, flight, images, positions in axes
     ]
     methods = [_OURS, *args.peers]
-    every = [
-        (case, method, _path(args.out, case, method))
-        for case in cases
-        for method in methods
-        if not (case.positions == "nothing" and method == WITH_POSITIONS)
-    ]
+    every = [(case, method, _path(args.out, case, method)) for case in cases for method in methods]
     batches: dict[tuple[str, int], list[tuple[Case, str, Path]]] = {}
     for item in every:
         if not item[2].is_file():
@@ -197,8 +187,7 @@ def main(arguments: Sequence[str]) -> None:
     add("--positions", type=options.names, default=",".join(POSITIONS))
     add("--seeds", type=options.numbers, default="1-3")
     add("--points", type=options.positive, default=500, help="about so many tie points in an image")
-    add("--start", choices=("mapped", "perturbed"), default="mapped")
-    add("--peers", type=options.names, default="", help=f"of {', '.join(PEERS)}")
+    add("--peers", type=options.names, default="colmap-opencv", help=f"of {', '.join(PEERS)}")
     add("--jobs", type=options.positive, default=2)
     options.add_output(parser)
     quick = {"scenes": "farmland", "flights": "cross", "images": "12", "seeds": "1", "points": 300}
@@ -210,9 +199,7 @@ def main(arguments: Sequence[str]) -> None:
     (args.out / "rows").mkdir(parents=True, exist_ok=True)
     rows = list(rows_of(args))
     write_rows(args.out / "results.json", rows)
-    versions: dict[str, stamps.Version] = {"stage.adjust": adjust.VERSION}
-    if args.start == "mapped":
-        versions["stage.orient"] = orient.VERSION
+    versions: dict[str, stamps.Version] = {"stage.adjust": adjust.VERSION, "stage.orient": orient.VERSION}
     options.publish(
         args, table_of(rows) + "\n", args.out / "calibration.md", table="bench_calibration",
         command=options.command_line(parser, args), versions=versions,
