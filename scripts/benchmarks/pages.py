@@ -67,11 +67,6 @@ def table_names(page_text: str) -> list[str]:
     return [match[1] for match in _TABLE.finditer(page_text)]
 
 
-def every_table() -> list[str]:
-    """Names of the tables of all pages."""
-    return [name for path in sorted(FOLDER.glob("*.md")) for name in table_names(path.read_text(encoding="utf-8"))]
-
-
 def table_text(name: str) -> str:
     """What stands between a table's markers; "" where it has not been made yet."""
     text = page_of(name).read_text(encoding="utf-8")
