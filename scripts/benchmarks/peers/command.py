@@ -140,8 +140,8 @@ def main(arguments: Sequence[str]) -> None:
     quick: dict[str, object] = {"pairs": 3, "keypoints": 512}
     if section == "rendered":
         scenes = "city,suburb,hills"
-        options.add_rendered(parser, scenes=scenes, pairs=8, size="800x600", images=12, flights="oblique")
-        quick |= {"scenes": "suburb", "size": "480x360", "images": 10}
+        options.add_rendered(parser, scenes=scenes, pairs=8, size="800x600", images=16, flights="mixed")
+        quick |= {"scenes": "suburb", "size": "480x360", "images": 8}
     else:
         add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
         add("--blocks", type=options.names, default="lewis,ochota", help="names, comma-separated")
