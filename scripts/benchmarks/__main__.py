@@ -37,6 +37,7 @@ TABLE: Table = {
     "shadow": ("benchmarks.shadow", "masks of `enhance=shadow` against rendered truth and hand labels"),
     "scenes": ("benchmarks.contact_sheet", "one picture of every rendered scene: .assets/scenes.jpg"),
     "picture": ("benchmarks.picture", "the README's picture: one hard pair, SIFT beside a preset, by exact truth"),
+    "speed": ("benchmarks.speed", "seconds and memory of whole runs beside pycolmap, on an easy and a hard block"),
     "growth": ("benchmarks.growth", "seconds and memory of every stage against the number of images"),
     "memory": ("benchmarks.memory", "peak memory of whole runs against --memory, on large images"),
     "device": ("benchmarks.device", "images and pairs a second of the networks on a CUDA device, beside its limit"),
