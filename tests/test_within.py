@@ -100,6 +100,7 @@ def test_a_deadline_counts_what_follows_matching(site: Site, monkeypatch: pytest
     assert deadline.words()[0].startswith("within 100s      ended after 40 s; left out: nothing")
 
 
+@pytest.mark.slow
 def test_a_size_that_the_first_pass_does_not_feel_leaves_the_orientation(site: Site) -> None:
     """So that it is not made again where --within reduces the images after it."""
     assert site("orient").facts["stages"]["orient"]["done"] == 5
