@@ -68,12 +68,15 @@ class Deadline:
 def fitting(context: Context, deadline: Deadline) -> Settings | None:
     """Return settings with smaller images and fewer keypoints with which a block can be matched in time; None where
     they need not change. What they leave out is noted."""
-    tried = check.tried_pair(context, context.pairs[len(context.pairs) // 2])
-    if tried is None:
+    in_time = deadline.holds(0.0, context)
+    tried = check.tried_pair(context, context.pairs[len(context.pairs) // 2]) if in_time else None
+    if in_time and tried is None:  # its images cannot be read
         return None
     jobs, share = context.executor.jobs, 1.0
 
     def needed_s() -> float:
+        if tried is None:
+            return 0.0
         images_s, pairs_s = len(context.block.images) * tried.image_s, len(context.pairs) * tried.pair_s
         return (images_s * share + pairs_s * share**2) / jobs
 
@@ -114,7 +117,8 @@ def steps_in_time(context: Context, deadline: Deadline) -> list[StepContext]:
         part = replace(context, settings=context.settings.model_copy(update={"cascade": every[:count]}))
         if count:
             step = cascade.steps_on_file(part)[-1]
-            if step.reasons and not deadline.holds(_step_s(step), context):
+            in_time = deadline.holds(0.0, context)
+            if step.reasons and not (in_time and deadline.holds(_step_s(step), context)):
                 deadline.left_out += [f"step {name.name}" for name in every[count - 1 :]]
                 deadline.left_out[-len(every[count - 1 :])] += f" of {len(step.reasons)} pairs"
                 break

@@ -44,6 +44,7 @@ PAGES: Mapping[str, str] = {
     "bench_device": "large.md",
     "bench_memory": "large.md",
     "bench_speed": "large.md",
+    "bench_speed_runs": "large.md",
     "bench_blocks": "methods.md",
     "bench_thinned": "methods.md",
     "bench_fusion": "fusion.md",
