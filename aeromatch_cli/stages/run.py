@@ -49,7 +49,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.stages.within import Deadline, fitting, measured_in_time, steps_in_time
+from aeromatch_cli.stages.within import Deadline, fitting, measured_in_time, page_in_time, steps_in_time
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace, locked
 
@@ -225,7 +225,7 @@ def _attempt(
     if deadline is not None:
         deadline.left_out.clear()  # of an attempt that met a damaged file
         if smaller := fitting(context, deadline):
-            said(f"within           {deadline.text} without {'; '.join(deadline.left_out)}")
+            said(f"within           {deadline.text}: left out for that: {'; '.join(deadline.left_out)}")
             context, *reports = pairs.prepare(smaller, executor, index=index, exports=exports)
             context = context.with_scope(overwrite=overwrite)
     if command == "run":
@@ -298,20 +298,21 @@ def _run_all(context: Context, read: StageReport, deadline: Deadline | None) -> 
             )
         if deadline is not None:
             context = measured_in_time(context, deadline)
-            _tell_left_out(context, read, deadline)
+        _tell_left_out(context, read, [] if deadline is None else deadline.left_out)
         after = graph.RUN[graph.RUN.index("filter") + 1 :]
         reports += [FUNCTIONS[name](context) for name in after if name != "report"]
-        if context.settings.run.report:
+        if context.settings.run.report if deadline is None else page_in_time(context, deadline):
             reports.append(_page(context))
     return reports
 
 
-def _tell_left_out(context: Context, read: StageReport, deadline: Deadline) -> None:
+def _tell_left_out(context: Context, read: StageReport, left_out: list[str]) -> None:
     """Note in the report of the stage pairs what is left out, for the page."""
     assert isinstance(read.result, PairsResult)
-    read.result = read.result.model_copy(update={"left_out": list(deadline.left_out)})
-    read.started = time.perf_counter() - read.seconds
-    read.write(context.workspace)
+    if left_out != read.result.left_out:
+        read.result = read.result.model_copy(update={"left_out": list(left_out)})
+        read.started = time.perf_counter() - read.seconds
+        read.write(context.workspace)
 
 
 def _without_keypoints(context: Context) -> str:

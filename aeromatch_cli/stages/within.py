@@ -84,11 +84,7 @@ def fitting(context: Context, deadline: Deadline) -> Settings | None:
         if deadline.holds(needed_s(), context):
             break
         share /= 2
-    if share == 1.0:
-        return None
-    if not deadline.holds(needed_s(), context):
-        deadline.left_out.append(f"more time is needed than {deadline.text} in any case")
-    return _reduced(context, share, deadline)
+    return None if share == 1.0 else _reduced(context, share, deadline)
 
 
 def _reduced(context: Context, share: float, deadline: Deadline) -> Settings:
@@ -137,6 +133,14 @@ def _step_s(step: StepContext) -> float:
     return (step.own_features * len(step.images) * tried.image_s + len(step.reasons) * tried.pair_s) / (
         context.executor.jobs
     )
+
+
+def page_in_time(context: Context, deadline: Deadline) -> bool:
+    """Whether there is time for the page of a report that is asked for."""
+    if context.settings.run.report and deadline.spent_s > deadline.seconds:
+        deadline.left_out.append("the report page (`aeromatch report` makes it)")
+        return False
+    return context.settings.run.report
 
 
 def measured_in_time(context: Context, deadline: Deadline) -> Context:
