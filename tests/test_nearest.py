@@ -1,5 +1,6 @@
 """Mutual nearest neighbours against a brute-force reference."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -288,3 +289,15 @@ def test_a_pair_uses_the_pictures_that_agree(same_light, both_enhanced):
 def test_the_table_names_its_classes():
     assert set(MATCHERS) == {"nearest", "bidirectional", "lightglue", "polar"}
     assert all(MATCHERS[name].model_fields["name"].default == name for name in MATCHERS)
+
+
+@pytest.mark.parametrize("capable", [True, False])
+def test_torch_is_loaded_for_many_products_alone(monkeypatch: pytest.MonkeyPatch, capable: bool) -> None:
+    monkeypatch.delitem(sys.modules, "torch")
+    monkeypatch.setattr(scan, "_WORK", scan._Work())
+    monkeypatch.setattr(scan, "_may_multiply_bytes", lambda: capable)
+    pair = 8000 * 8000
+    asked = [scan._worth_torch(pair) for _ in range(20)]
+    assert asked == [capable and number * pair > 1_000_000_000 for number in range(1, 21)]
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    assert scan._worth_torch(1)

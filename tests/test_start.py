@@ -33,6 +33,15 @@ def test_configuration_and_stages_import_nothing_heavy() -> None:
     assert not imported_by("import aeromatch_cli.stages.run") & HEAVY
 
 
+def test_networks_that_nothing_asks_load_no_torch() -> None:
+    """Whatever device they are for: the default takes CUDA where there is one."""
+    statement = (
+        "from aeromatch_cli.config import load; load('fusion').match.check_files(128); "
+        "load('oblique').extract.check_files(128)"
+    )
+    assert "torch" not in imported_by(statement)
+
+
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["run", "--help"]])
 def test_help_answers_in_half_a_second(arguments: list[str]) -> None:
     """In seconds of the processor, as other tests may keep it busy: nothing here waits for anything else. Best of

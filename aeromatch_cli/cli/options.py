@@ -244,6 +244,15 @@ ShardText = Annotated[
         help="Only part I of N of the images and pairs; not for check, adjust, export, report.",
     ),
 ]
+Within = Annotated[
+    str | None,
+    typer.Option(
+        "--within",
+        metavar="DURATION",
+        rich_help_panel=_WORK,
+        help="End in this time (20m, 1h, 90s): smaller images, fewer keypoints and steps, where all would take longer.",
+    ),
+]
 Overwrite = Annotated[
     bool,
     typer.Option("--overwrite", rich_help_panel=_RESULTS, help="Make every result again, even if it is up to date."),

@@ -91,6 +91,7 @@ class Outcome(Line):
     lost: dict[str, str] | None = Field(
         None, description="After `run` and `adjust`: images that the result does not hold -> reason; as in lost.csv."
     )
+    left_out: list[str] | None = Field(None, description="After `run --within`: what it did without.")
     stages: Any = Field(description="What each stage did.")
 
 

@@ -38,6 +38,7 @@ from aeromatch_cli.cli.options import (
     Set,
     ShardText,
     Strict,
+    Within,
     WorkspaceDir,
 )
 from aeromatch_cli.cli.output import as_texts, guarded, said
@@ -50,6 +51,8 @@ if TYPE_CHECKING:
 
 # Commands that start anew where no preset is named.
 _WHOLE = ("run", "check")
+# Option -> the only command that takes it.
+_OF_ONE_COMMAND = {"deep": "check", "within": "run"}
 # Commands that end with a verdict on the block.
 _JUDGED = ("run", "adjust")
 # Name: what the command does, and examples.
@@ -61,6 +64,7 @@ COMMAND_HELP: Mapping[str, tuple[str, Sequence[str]]] = {
             "aeromatch run baseline --images IMGS --poses exif --workspace WORK",
             "aeromatch run fusion --images IMGS --poses poses.csv --crs EPSG:32633",
             "aeromatch run oblique --images IMGS --poses poses.csv --set extract.keypoints=12000",
+            "aeromatch run --images IMGS --within 20m",
         ),
     ),
     "orient": (
@@ -143,7 +147,7 @@ COMMAND_HELP: Mapping[str, tuple[str, Sequence[str]]] = {
 
 
 def stage_command(name: str) -> Callable[..., None]:
-    """The command of one stage, of `run` or of `check`: all take the same options, but `--deep`, which is `check`'s."""
+    """The command of one stage, of `run` or of `check`: all take the same options, but those of one alone."""
 
     def command(
         context: typer.Context,
@@ -167,6 +171,7 @@ def stage_command(name: str) -> Callable[..., None]:
         executor: ExecutorName = None,
         scheduler: Scheduler = None,
         shard: ShardText = None,
+        within: Within = None,
         deep: Deep = False,
         overwrite: Overwrite = False,
         strict: Strict = False,
@@ -210,14 +215,14 @@ def stage_command(name: str) -> Callable[..., None]:
             _check_control(block, settings.block)
             course = graph.course(shard=shard is not None) if name == "run" else ()
             shown = progress_shown(progress, quiet=quiet, stages=course)
-            return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=say)
+            return execute(name, settings, shard=shard, within=within, overwrite=overwrite, progress=shown, say=say)
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context, strict=strict)
 
-    if name != "check":
-        every = inspect.signature(command, eval_str=True)
-        own = [option for option in every.parameters.values() if option.name != "deep"]
-        command.__signature__ = every.replace(parameters=own)  # type: ignore[attr-defined]
+    others = {option for option, command_of in _OF_ONE_COMMAND.items() if name != command_of}
+    every = inspect.signature(command, eval_str=True)
+    own = [option for option in every.parameters.values() if option.name not in others]
+    command.__signature__ = every.replace(parameters=own)  # type: ignore[attr-defined]
     return command
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
@@ -16,14 +18,19 @@ Device = Literal["cpu", "cuda", "auto"]
 # A strategy's setting. Where a network runs is no part of a recipe, as the processor is none: answers differ by the
 # rounding of the precision, which is a setting of its own for who wants the same one everywhere.
 DEVICE: Any = Field(
-    "cpu", description="`auto` takes CUDA where there is one.", json_schema_extra={"fingerprint": "left out"}
+    "auto",
+    description="Where the network runs; auto: on CUDA where there is one. Results of the two are equal to a "
+    "tolerance; cpu: the same bits everywhere.",
+    json_schema_extra={"fingerprint": "left out"},
 )
+# What a driver of NVIDIA makes below /dev: on a machine, on Jetson, and in WSL.
+_DRIVERS = ("nvidia*", "nvhost*", "nvmap", "dxg")
 
 
 def device_of(setting: Device) -> str:
     """The device a setting means: "cuda" where `auto` finds one, else "cpu". Raises ConfigError where there is none."""
-    if setting == "cpu":
-        return setting
+    if setting == "cpu" or (setting == "auto" and not _may_have_cuda()):
+        return "cpu"
     import torch
 
     if torch.cuda.is_available():
@@ -31,6 +38,18 @@ def device_of(setting: Device) -> str:
     if setting == "cuda":
         raise ConfigError("device `cuda`: torch sees none on this machine; set `auto`, which takes one where there is")
     return "cpu"
+
+
+def check_device(setting: Device) -> None:
+    """Raise ConfigError where the device that a setting names is not there. `auto` fits any machine: torch, which takes
+    seconds to load, is not asked."""
+    if setting == "cuda":
+        device_of(setting)
+
+
+def _may_have_cuda() -> bool:
+    """Whether torch may find a device, without loading it; only Linux tells."""
+    return sys.platform != "linux" or any(next(Path("/dev").glob(name), None) for name in _DRIVERS)
 
 
 def layer_type(precision: Precision, device: str = "cpu") -> torch.dtype:

@@ -256,7 +256,10 @@ def _gravest_first(*found: Iterable[Notice]) -> list[Notice]:
 
 
 def _input_notices(block: PairsResult | None) -> list[Notice]:
-    return [] if block is None else [Notice("warn", "Note on the input", warning) for warning in block.warnings]
+    if block is None:
+        return []
+    left = [Notice("warn", "Left out to end in time", words) for words in block.left_out]
+    return [*left, *(Notice("warn", "Note on the input", warning) for warning in block.warnings)]
 
 
 def _orientation_notices(oriented: OrientResult, names: Mapping[str, str]) -> Iterator[Notice]:

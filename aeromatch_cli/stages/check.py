@@ -163,8 +163,7 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
     estimate["seconds_of_further_steps"] = _further_s(seen, sampled)
     if estimate["seconds"] is not None:
         own_s = estimate["seconds"] - estimate["seconds_to_start"] + (estimate["seconds_to_orient"] or 0.0)
-        page_s = _PAGE_S if context.settings.run.report else 0.0
-        estimate["seconds_after_matching"] = round(own_s * _later(context) + page_s, 1)
+        estimate["seconds_after_matching"] = round(later_s(context, own_s), 1)
         estimate["seconds"] = round(estimate["seconds_to_start"] + own_s + estimate["seconds_after_matching"], 1)
     return Check(_lines(context, estimate, len(images) + lost), estimate, failures)
 
@@ -188,10 +187,10 @@ def _looking_down(context: Context) -> Context:
     return replace(context, block=with_gsd(block, (None, None), context.settings.block.max_size_px))
 
 
-def _later(context: Context) -> float:
-    """Seconds of what follows matching for one of what leads to it."""
+def later_s(context: Context, before_s: float) -> float:
+    """Estimate the seconds of what follows matching. before_s: of what leads to it."""
     adjusts = context.settings.first_pass is not None and not context.settings.match.reads_pixels
-    return _LATER if adjusts else 0.0
+    return before_s * (_LATER if adjusts else 0.0) + (_PAGE_S if context.settings.run.report else 0.0)
 
 
 def _orientation(context: Context, sampled: Sequence[Pair]) -> tuple[float | None, int]:
@@ -205,27 +204,27 @@ def _orientation(context: Context, sampled: Sequence[Pair]) -> tuple[float | Non
     if sum(pose.world_rotation is not None for pose in block.poses.values()) == len(block.images):
         look = first_pass.look(recipe, block)
         looking = first_pass.prepared(context, look)
-        tried = [_try(looking, pair) for pair in sampled]
+        tried = [tried_pair(looking, pair) for pair in sampled]
         known = [one for one in tried if one is not None]
         if not known:
             return None, look.keypoints
         seconds = _pass_s(context, look, known[0])
         if _explained(context, looking, list(zip(sampled, tried, strict=True))) or not recipe.replaces:
             return round(seconds, 1), look.keypoints
-    found = _try(first_pass.prepared(context, recipe), sampled[0])
+    found = tried_pair(first_pass.prepared(context, recipe), sampled[0])
     if found is None:
         return None, recipe.keypoints
     mapping_s = _MAPPING_S + _MAPPING_S_PER_IMAGE * len(block.images)
     return round(seconds + _pass_s(context, recipe, found) + mapping_s, 1), recipe.keypoints
 
 
-def _pass_s(context: Context, recipe: FirstPass, tried: _TriedPair) -> float:
+def _pass_s(context: Context, recipe: FirstPass, tried: TriedPair) -> float:
     """Seconds of a first pass."""
     count, pairs = len(context.block.images), first_pass.count_pairs(context, recipe)
     return (count * tried.image_s + pairs * tried.pair_s) / context.executor.jobs
 
 
-def _explained(context: Context, first: Context, tried: Sequence[tuple[Pair, _TriedPair | None]]) -> bool:
+def _explained(context: Context, first: Context, tried: Sequence[tuple[Pair, TriedPair | None]]) -> bool:
     """Whether given poses explain the matches of all sampled pairs that have enough of them."""
     block = context.block
     cameras = {image.image_id: block.camera(image) for image in block.images}
@@ -242,7 +241,7 @@ def _further_s(context: Context, sampled: Sequence[Pair]) -> float | None:
     """Seconds that the further steps of a cascade take where every pair needs them; None where that is unknown."""
     every_s = 0.0
     for step in cascade.further_steps(context):
-        tried = _try(step.context, sampled[0]) if sampled else None
+        tried = tried_pair(step.context, sampled[0]) if sampled else None
         if tried is None:
             return None
         every_s += step.own_features * len(context.block.images) * tried.image_s + len(context.pairs) * tried.pair_s
@@ -250,7 +249,7 @@ def _further_s(context: Context, sampled: Sequence[Pair]) -> float | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _TriedPair:
+class TriedPair:
     """Seconds of an image and of the pair, and its verified matches as in `_Tried`."""
 
     image_s: float
@@ -258,7 +257,7 @@ class _TriedPair:
     verified: tuple[FloatArray, FloatArray]
 
 
-def _try(context: Context, pair: Pair) -> _TriedPair | None:
+def tried_pair(context: Context, pair: Pair) -> TriedPair | None:
     """A trial of one pair and its images; None where these cannot be read."""
     ids = pair.image_id0, pair.image_id1
     one = replace(context, pairs=(pair,))
@@ -270,7 +269,7 @@ def _try(context: Context, pair: Pair) -> _TriedPair | None:
     tried = _time_pairs(one, one.pairs, timed)
     if not tried:
         return None
-    return _TriedPair(_mean([one.seconds for one in timed.values()]), tried[0].seconds, tried[0].verified)
+    return TriedPair(_mean([one.seconds for one in timed.values()]), tried[0].seconds, tried[0].verified)
 
 
 def _sample(context: Context) -> list[Pair]:
@@ -370,22 +369,23 @@ def _existing(path: Path) -> Path:
 
 def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str, ...]:
     seconds = estimate["seconds"]
-    duration = "unknown (the sample could not be read)" if seconds is None else f"about {_duration(seconds)}"
+    needed = "unknown (the sample could not be read)" if seconds is None else f"about {duration(seconds)}"
     further_s, names = estimate["seconds_of_further_steps"], " and ".join(s.name for s in context.settings.cascade)
     orient_s = estimate["seconds_to_orient"] or 0.0
-    orienting = f"orient    about {_duration(orient_s)} of that; pairs above are those of the poses as they are given"
+    orienting = f"orient    about {duration(orient_s)} of that; pairs above are those of the poses as they are given"
     return (
         f"images    {estimate['readable_images']} of {images} readable",
         f"pairs     {estimate['pairs']}",
-        f"time      {duration} with {context.executor.jobs} jobs",
+        f"time      {needed} with {context.executor.jobs} jobs",
         *([orienting] if seconds is not None and orient_s else []),
-        *([f"further   {names}: up to {_duration(further_s)} more, where all pairs need it"] if further_s else []),
+        *([f"further   {names}: up to {duration(further_s)} more, where all pairs need it"] if further_s else []),
         f"memory    about {estimate['memory_mb']} MB with {context.executor.jobs} jobs",
         f"disk      about {estimate['disk_mb']} MB needed, {estimate['disk_free_mb']} MB free",
     )
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Say how long something takes."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

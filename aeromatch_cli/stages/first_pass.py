@@ -20,6 +20,7 @@ from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies.enhancers.none import NoEnhancement
+from aeromatch_cli.strategies.extractors.reduction import LEAST_PX
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.filters.poselib import Poselib
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
@@ -50,8 +51,7 @@ def fitted(recipe: FirstPass, block: Block) -> FirstPass:
     """Return the first pass as it is made of a block: large ones have ties to spare."""
     if not is_large(block):
         return recipe
-    sizes_px = {(image.width_px, image.height_px) for image in block.images}
-    most_px = max(w * h * min(1.0, recipe.size_px / max(w, h)) ** 2 for w, h in sizes_px)
+    most_px = max(_pixels(recipe, block))
     return recipe.model_copy(
         update={
             "keypoints": min(recipe.keypoints, max(_LEAST_KEYPOINTS, round(most_px / _PX_PER_KEYPOINT))),
@@ -84,6 +84,22 @@ def thorough(recipe: FirstPass, first: Context) -> FirstPass | None:
     return recipe.model_copy(update={"keypoints": _MORE_KEYPOINTS * recipe.keypoints})
 
 
+def finer(recipe: FirstPass, block: Block) -> FirstPass | None:
+    """Return the first pass that halves no image; None where none is halved anyway."""
+    most_px = max(_pixels(recipe, block))
+    if recipe.pixels_per_keypoint == 0.0 or most_px < max(
+        recipe.pixels_per_keypoint * recipe.keypoints, 4.0 * LEAST_PX
+    ):
+        return None
+    return recipe.model_copy(update={"pixels_per_keypoint": 0.0})
+
+
+def _pixels(recipe: FirstPass, block: Block) -> Iterator[float]:
+    """Pixels of the images of a first pass, by size."""
+    for w, h in {(image.width_px, image.height_px) for image in block.images}:
+        yield w * h * min(1.0, recipe.size_px / max(w, h)) ** 2
+
+
 def prepared(context: Context, recipe: FirstPass, part: str = "first pass") -> Context:
     """Return the context of the first pass of a block, without pairs; nothing is run yet. part: what is said to be
     done."""
@@ -97,7 +113,7 @@ def prepared(context: Context, recipe: FirstPass, part: str = "first pass") -> C
             "run": settings.run.model_copy(update={"keep_images": False}),
             "enhance": NoEnhancement(),
             "simulate": SourceOnly(),
-            "extract": Sift(keypoints=recipe.keypoints, pixels_per_keypoint=0.0),  # size_px says how large
+            "extract": Sift(keypoints=recipe.keypoints, pixels_per_keypoint=recipe.pixels_per_keypoint),
             "match": Nearest(),
             "filter": (Poselib(model="fundamental"),),
         }

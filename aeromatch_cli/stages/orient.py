@@ -45,7 +45,7 @@ from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 
 # The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
-VERSION, _LARGE_BLOCK_VERSION = 25, 1
+VERSION, _LARGE_BLOCK_VERSION = 26, 1
 _DATA = "orientation/orientation.json"
 # What failures.csv calls the mapper's process.
 _MAPPING = "mapping"
@@ -254,10 +254,16 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
             taken, image.camera_id, block.camera(image), place, context.given.angles.get(image.image_id),
             context.given.likely_focals.get(image.camera_id),
         )  # fmt: skip
-    how: list[Any] = [settings.orient, settings.block.max_size_px, _LARGE_BLOCK_VERSION]
+    how: list[Any] = [settings.orient, _limit_px(context), _LARGE_BLOCK_VERSION]
     if settings.similar is not None:
         how.append(settings.similar)
     return images, fingerprint(VERSION, library_version("pycolmap"), how, block.crs, block.origin_m)
+
+
+def _limit_px(context: Context) -> int:
+    """The size to which the settings reduce images, where the first pass takes them no smaller; else 0."""
+    recipe, limit_px = context.settings.first_pass, context.settings.block.max_size_px
+    return limit_px if recipe is not None and limit_px < recipe.size_px else 0
 
 
 def _on_file(context: Context) -> tuple[OrientationRecord | None, str]:

@@ -23,7 +23,7 @@ from aeromatch_cli.stages.context import Context, Scope
 from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network
 from aeromatch_cli.stages.messages import orientation_lines
 from aeromatch_cli.stages.shard import Shard
-from aeromatch_cli.stages.stage_report import StageReport, forget_absent
+from aeromatch_cli.stages.stage_report import StageReport, forget_absent, result_on_file
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.workspace import Workspace
@@ -79,6 +79,7 @@ def prepare(
     oriented_lines = [] if as_oriented is None else orientation_lines(as_oriented, found.given.block, context.block)
     remarks = [] if as_oriented is None else as_oriented.remarks
     said_later = [*remarks, *(w for w in summary.warnings if w not in known)]
+    before = result_on_file(workspace, PairsResult)
     result = PairsResult(
         summary=[*given_lines, *oriented_lines, *summary.lines(), *_remarks(settings)],
         block=summary.figures(),
@@ -86,6 +87,7 @@ def prepare(
         urgent=sorted(found.urgent),
         unread=dict(found.unread),
         images=len(found.given.block.images),
+        left_out=[] if before is None else before.left_out,  # until a whole run says otherwise
     )
     report.result = result
     report.failures = list(found.failures)

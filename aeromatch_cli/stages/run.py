@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from aeromatch_cli import graph, report
@@ -17,7 +18,7 @@ from aeromatch_cli.files import remove_stale_temporaries, translated_os_errors
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
-from aeromatch_cli.results.stages import FilterResult
+from aeromatch_cli.results.stages import FilterResult, PairsResult
 from aeromatch_cli.stages import (
     adjust,
     cascade,
@@ -48,6 +49,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.within import Deadline, fitting, measured_in_time, page_in_time, steps_in_time
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace, locked
 
@@ -71,17 +73,22 @@ def execute(
     settings: Settings,
     *,
     shard: str | None = None,
+    within: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Result:
     """Run one command. Raises AeromatchError where nothing can be done, KeyboardInterrupt where it was stopped.
 
-    say: gets the summary of the block before the long stages; without it the summary stands in the result's lines.
+    within: how long a whole run may take, such as 20m. say: gets the summary of the block before the long stages;
+    without it the summary stands in the result's lines.
     """
     part = Shard.parse(shard) if shard else None
     if part and not graph.sharded(command):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
+    if within and (part or command != "run"):
+        raise ConfigError("--within is for a whole `aeromatch run`: leave out --within, or --shard")
+    deadline = Deadline(within) if within else None
     root = Path(settings.workspace)
     if settings.block.images and command in graph.NEED_RESULTS and not root.exists():
         raise InputError(f"the workspace {root} does not exist: run `aeromatch run`, which makes it, or name another")
@@ -100,8 +107,8 @@ def execute(
                 Executor(run.executor, run.jobs, progress, run.scheduler) as executor,
                 _index(Workspace(root.absolute()), command, part) as index,
             ):
-                result = _repairing(command, settings, executor, index, part, overwrite, Said(say))
-                if inputs and not result.failures:
+                result = _repairing(command, settings, executor, index, part, deadline, overwrite, Said(say))
+                if inputs and not result.failures and not (deadline and deadline.left_out):
                     up_to_date.remember(Workspace(root), index, inputs, result.reports)
             return named(result, root)
         except BaseException as error:
@@ -159,13 +166,20 @@ def _index(workspace: Workspace, command: str, part: Shard | None) -> Iterator[I
 
 
 def _repairing(
-    command: str, settings: Settings, executor: Executor, index: Index, part: Shard | None, overwrite: bool, said: Said
+    command: str,
+    settings: Settings,
+    executor: Executor,
+    index: Index,
+    part: Shard | None,
+    deadline: Deadline | None,
+    overwrite: bool,
+    said: Said,
 ) -> Result:
     """Repeats the command until it meets no damaged file; each one is deleted, so that it is made again."""
     repaired: set[str] = set()
     while True:
         try:
-            return _attempt(command, settings, executor, index, part, overwrite, said)
+            return _attempt(command, settings, executor, index, part, deadline, overwrite, said)
         except BrokenFileError as error:
             if command == "check" or error.path in repaired:
                 raise
@@ -186,7 +200,14 @@ def _makes(command: str, workspace: Workspace, path: Path) -> bool:
 
 
 def _attempt(
-    command: str, settings: Settings, executor: Executor, index: Index, part: Shard | None, overwrite: bool, said: Said
+    command: str,
+    settings: Settings,
+    executor: Executor,
+    index: Index,
+    part: Shard | None,
+    deadline: Deadline | None,
+    overwrite: bool,
+    said: Said,
 ) -> Result:
     dry = command == "check"
     workspace = Workspace(Path(settings.workspace))
@@ -201,8 +222,14 @@ def _attempt(
     )
     if command == "check":
         return _check(context, reports[0], reports[-1], said)
+    if deadline is not None:
+        deadline.left_out.clear()  # of an attempt that met a damaged file
+        if smaller := fitting(context, deadline):
+            said(f"within           {deadline.text}: left out for that: {'; '.join(deadline.left_out)}")
+            context, *reports = pairs.prepare(smaller, executor, index=index, exports=exports)
+            context = context.with_scope(overwrite=overwrite)
     if command == "run":
-        reports += _run_all(context)
+        reports += _run_all(context, reports[-1], deadline)
     elif context.settings.cascade and command in _AFTER_CASCADE:
         context, made = _cascaded(context) if command == "match" else (_joined(context), [])
         reports += made
@@ -221,10 +248,14 @@ def _attempt(
     names = {image.image_id: image.name for image in context.block.images}
     failures = all_failures(command, context, reports)
     old_page = command in JUDGED and report.is_of_earlier_results(context.workspace)
-    return command_result(
+    result = command_result(
         command, context.settings, context.workspace, names, reports, failures, said,
         part=context.scope.shard is not None, old_page=old_page,
     )  # fmt: skip
+    if deadline is None:
+        return result
+    facts = {**result.facts, "left_out": deadline.left_out}
+    return replace(result, lines=(*result.lines, *deadline.words()), facts=facts)
 
 
 def _there(settings: Settings) -> bool:
@@ -240,9 +271,9 @@ def _stages_of(command: str, context: Context) -> list[StageReport]:
     return [FUNCTIONS[name](context if name == command else kept) for name in graph.COMMANDS[command]]
 
 
-def _cascaded(context: Context) -> tuple[Context, list[StageReport]]:
-    """Run all steps of a cascade and, unless it is a shard, merge what they have found."""
-    steps = cascade.run(context)
+def _cascaded(context: Context, deadline: Deadline | None = None) -> tuple[Context, list[StageReport]]:
+    """Run all steps of a cascade that fit in time and, unless it is a shard, merge what they have found."""
+    steps = cascade.run(context) if deadline is None else steps_in_time(context, deadline)
     if context.scope.shard is not None:
         return context, [report for step in steps for report in step.reports]
     joined = joined_steps.joined_context(context, steps)
@@ -254,9 +285,9 @@ def _joined(context: Context) -> Context:
     return joined_steps.joined_context(context, cascade.steps_on_file(context))
 
 
-def _run_all(context: Context) -> list[StageReport]:
-    """extract, match, filter; then adjust, consistency, export and report."""
-    context, reports = _to_filter(context)
+def _run_all(context: Context, read: StageReport, deadline: Deadline | None) -> list[StageReport]:
+    """extract, match, filter; then adjust, consistency, export and report. read: the report of the stage pairs."""
+    context, reports = _to_filter(context, deadline)
     if context.scope.shard is None:
         judged = reports[-1].result
         if not isinstance(judged, FilterResult) or not judged.verified_matches:
@@ -265,11 +296,23 @@ def _run_all(context: Context) -> list[StageReport]:
                 f"no pair could be verified: the table of pairs in {context.workspace.report} says why"
                 + _without_keypoints(context)
             )
+        if deadline is not None:
+            context = measured_in_time(context, deadline)
+        _tell_left_out(context, read, [] if deadline is None else deadline.left_out)
         after = graph.RUN[graph.RUN.index("filter") + 1 :]
         reports += [FUNCTIONS[name](context) for name in after if name != "report"]
-        if context.settings.run.report:
+        if context.settings.run.report if deadline is None else page_in_time(context, deadline):
             reports.append(_page(context))
     return reports
+
+
+def _tell_left_out(context: Context, read: StageReport, left_out: list[str]) -> None:
+    """Note in the report of the stage pairs what is left out, for the page."""
+    assert isinstance(read.result, PairsResult)
+    if left_out != read.result.left_out:
+        read.result = read.result.model_copy(update={"left_out": list(left_out)})
+        read.started = time.perf_counter() - read.seconds
+        read.write(context.workspace)
 
 
 def _without_keypoints(context: Context) -> str:
@@ -291,9 +334,9 @@ def _page(context: Context) -> StageReport:
     return page
 
 
-def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:
+def _to_filter(context: Context, deadline: Deadline | None) -> tuple[Context, list[StageReport]]:
     if context.settings.cascade:
-        context, reports = _cascaded(context)
+        context, reports = _cascaded(context, deadline)
         return context, reports if context.scope.shard is not None else [*reports, filter.run(context)]
     features = extract.run_own_first(context, match.images_of_rows(context))
     return context, [features, match.run(context), filter.run(context)]

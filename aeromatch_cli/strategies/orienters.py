@@ -30,6 +30,12 @@ class FirstPass(Strategy):
         "100 take one per 200 pixels, blocks that fall into parts three times as many in a second try. Larger: more "
         "time, more ties.",
     )
+    pixels_per_keypoint: float = Field(
+        600.0,
+        ge=0.0,
+        description="Images are halved while they have more pixels per keypoint than this; where that leaves images "
+        "out, all are looked at once more as they are. 0: never halved. Smaller: less time.",
+    )
     neighbours: int = Field(
         20,
         ge=2,

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.precision import DEVICE, Device, Precision, device_of
+from aeromatch_cli.nets.precision import DEVICE, Device, Precision, check_device, device_of
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.context import as_bytes, with_context
 from aeromatch_cli.strategies.extractors.described import Described, pixels_field
@@ -83,7 +83,7 @@ class Learned(Described):
     def check_files(self, descriptor_length: int) -> None:
         """Weights of a user are loaded once; the device is looked for."""
         super().check_files(descriptor_length)
-        device_of(self.device)
+        check_device(self.device)
         if self.weights is None:
             return
         folder = Path(self.weights).expanduser()

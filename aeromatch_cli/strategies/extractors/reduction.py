@@ -16,12 +16,12 @@ from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.detection import Raw
 
 # Images of fewer pixels take hardly any time.
-_LEAST_PX = 400_000
+LEAST_PX = 400_000
 
 
 def factor_for(camera: Camera, views: Sequence[ViewPixels], keypoints: int, most_px: float) -> int:
     """The power of two by which views are reduced that share a number of keypoints: the smallest that leaves the image
-    at most most_px pixels for each keypoint, and at least _LEAST_PX in all; 1 where most_px is 0.
+    at most most_px pixels for each keypoint, and at least LEAST_PX in all; 1 where most_px is 0.
 
     The pixels of the image count, not those of its views: images of one camera shall be reduced alike, however many
     views they have and whatever ground these show, because only then have they the same blobs.
@@ -29,7 +29,7 @@ def factor_for(camera: Camera, views: Sequence[ViewPixels], keypoints: int, most
     pixels = camera.width_px * camera.height_px
     sides = [side for view in views for side in view.gray.shape]
     factor = 1
-    while 0.0 < most_px * keypoints * factor**2 < pixels and pixels >= _LEAST_PX * (2 * factor) ** 2:
+    while 0.0 < most_px * keypoints * factor**2 < pixels and pixels >= LEAST_PX * (2 * factor) ** 2:
         if min(sides) < 2 * factor:  # a sliver
             break
         factor *= 2

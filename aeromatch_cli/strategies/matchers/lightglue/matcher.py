@@ -16,7 +16,7 @@ from pydantic import Field
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.precision import DEVICE, Device, Precision, device_of
+from aeromatch_cli.nets.precision import DEVICE, Device, Precision, check_device, device_of
 from aeromatch_cli.strategies.matchers.descriptors.assignment import one_to_one
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined, ratio_test
 from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
@@ -118,7 +118,7 @@ class LightGlue(Search):
     def check_files(self, descriptor_length: int) -> None:
         """Loads the user's own weights once. Those of the package are checked by `aeromatch weights verify`."""
         (path,) = self.fingerprint_files()
-        device_of(self.device)
+        check_device(self.device)
         if self.weights is not None:
             from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 

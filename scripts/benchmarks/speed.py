@@ -1,0 +1,221 @@
+"""Seconds and memory of whole runs: `baseline`, `auto` and pycolmap on rendered blocks, an easy and a hard one.
+
+A block is rendered once, at the smallest size, and enlarged to the others; neither is timed. easy: a suburb, nadir
+strips, one sun; hard: a city, two flights at two heights across each other under two suns. All are given the camera;
+aeromatch is given positions of 5 m (`poses_gps.csv`) and no attitudes, so that it has to find the block.
+
+pycolmap is its SIFT on the CPU with as many keypoints and its own largest size of 3,200 pixels, its exhaustive
+matching with verification, and its global mapping. Its spatial matching takes 50 neighbours: for blocks up to 51
+images this is exhaustive matching.
+
+Wall: seconds of the command, start-up and report included. Processor: seconds of all processes together, which other
+work on the machine hardly changes; ratios are theirs. Peak: the largest sum of what all processes hold (PSS). Shares
+are those of wall seconds: pycolmap's matching includes verification, its adjustment is the mapping; the rest is start,
+pairs, consistency, export and report.
+
+Writes OUT/speed.json and OUT/speed.md. Rows that OUT has are not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli.config import load
+from aeromatch_cli.files import write_json
+from aeromatch_cli.geometry.cameras import corner_params, from_colmap, resized
+from benchmarks import options, stamps
+from benchmarks.memory import peak_mb
+from benchmarks.processes import children_seconds
+from benchmarks.scenes import render_once
+from benchmarks.stamps import REPOSITORY
+from benchmarks.tables import Row, code, factor, markdown, number, percent, ratio, write_rows
+
+SCENES = {"easy": ("suburb", "nadir"), "hard": ("city", "two-flights")}
+PEER = "pycolmap"
+CHAINS = ("baseline", "auto", PEER)
+# What the table shows of a chain by itself; extraction, matching and verification of all steps of a cascade together.
+STAGES = ("orient", "extract", "match", "filter", "refine", "adjust")
+_PEER_STAGES = ("extract", "match", "adjust")
+_POSES = "poses_gps.csv"
+
+
+def size_of(megapixels: int) -> tuple[int, int]:
+    """Width and height, pixels, of 4 : 3 pictures."""
+    height = round((megapixels * 1e6 * 0.75) ** 0.5)
+    return round(height / 0.75), height
+
+
+def block_of(args: argparse.Namespace, scene: str, megapixels: int, images: int) -> Path:
+    """Folder with images, block.json and poses of a block; made unless it is there."""
+    width, height = size_of(min(args.megapixels))
+    preset, flight = SCENES[scene]
+    size = {"width_px": width, "height_px": height, "images": images}
+    rendered = render_once(args.out / "scenes", preset, jobs=args.jobs, seed=args.seed, flight=flight, **size)
+    if megapixels == min(args.megapixels):
+        return rendered
+    return enlarged(rendered, args.out / "enlarged" / f"{rendered.name}-{megapixels}", size_of(megapixels))
+
+
+def enlarged(rendered: Path, out: Path, size: tuple[int, int]) -> Path:
+    """The same block with pictures and cameras of another size."""
+    if (out / "block.json").is_file():
+        return out
+    import cv2
+
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    for path in sorted((rendered / "images").iterdir()):
+        large = cv2.resize(cv2.imread(str(path)), size, interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(out / "images" / path.name), large, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    shutil.copy(rendered / _POSES, out / _POSES)
+    facts = _json(rendered / "block.json")
+    for lens in facts["cameras"].values():
+        camera = from_colmap(lens["model"], lens["width"], lens["height"], tuple(lens["params"]))
+        other = resized(camera, size[0] / camera.width_px, *size)
+        lens.update(width=other.width_px, height=other.height_px, params=list(corner_params(other)))
+    write_json(out / "block.json", facts)  # last: it says that the rest is there
+    return out
+
+
+def our_chain(args: argparse.Namespace, block: Path, preset: str, folder: Path) -> Row:
+    """One whole run."""
+    work = folder / "work"
+    shutil.rmtree(work, ignore_errors=True)
+    command = [sys.executable, "-m", "aeromatch_cli.cli", "run", preset, "--quiet", "--json"]
+    command += ["--images", str(block / "images"), "--poses", str(block / _POSES), "--workspace", str(work)]
+    command += ["--cameras", str(block / "block.json"), "--crs", "local", "--jobs", str(args.jobs)]
+    command += ["--set", f"extract.keypoints={args.keypoints}"]
+    row, answer = timed(command, folder / "said.log")
+    best = max((group["images"] for group in answer["stages"]["adjust"]["result"]["groups"]), default=0)
+    if not args.keep:
+        shutil.rmtree(work)
+    return row | {"oriented": best, "stages": {stage: answer["stages"][stage]["seconds"] for stage in STAGES}}
+
+
+def peer_chain(args: argparse.Namespace, block: Path, folder: Path) -> Row:
+    """The same by pycolmap, in a process of its own."""
+    given = str(block), str(folder), args.keypoints, args.jobs
+    words = f"import sys; sys.path[:0] = [{str(REPOSITORY / 'scripts')!r}, {str(REPOSITORY)!r}]; "
+    words += f"from benchmarks import speed; speed.run_peer{given!r}"
+    row, answer = timed([sys.executable, "-c", words], folder / "said.log")
+    return row | answer
+
+
+def timed(command: Sequence[str], log: Path) -> tuple[Row, dict[str, Any]]:
+    """Figures of a command, and the JSON object that it prints as its last line. SystemExit where it fails."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    used_s = children_seconds()
+    exit_code, seconds, peak = peak_mb(command, log)
+    answers = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line[:1] == "{"]
+    if exit_code not in (0, 1) or not answers:
+        raise SystemExit(f"{' '.join(command[:5])} ended with exit code {exit_code}: see {log}")
+    row = {"seconds": seconds, "processor_seconds": children_seconds() - used_s, "peak_mb": peak}
+    return row, json.loads(answers[-1])
+
+
+def run_peer(block: str, folder: str, keypoints: int, jobs: int) -> None:
+    """Extraction, matching and mapping by pycolmap; prints images oriented and seconds of stages as a JSON object."""
+    from benchmarks.peers.colmap import colmap_options, imported_pycolmap
+
+    pycolmap = imported_pycolmap()
+    images, database, models = Path(block) / "images", Path(folder) / "database.db", Path(folder) / "models"
+    database.unlink(missing_ok=True)
+    models.mkdir(exist_ok=True)
+    (lens,) = _json(Path(block) / "block.json")["cameras"].values()
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model, reader.camera_params = lens["model"], ",".join(map(repr, map(float, lens["params"])))
+    extraction, matching, verification = colmap_options(keypoints, jobs)
+    extraction.max_image_size = -1  # its own default
+    marks = [time.perf_counter()]
+    single = pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(
+        database, images, camera_mode=single, reader_options=reader, extraction_options=extraction
+    )
+    marks.append(time.perf_counter())
+    pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
+    marks.append(time.perf_counter())
+    mapping = pycolmap.GlobalPipelineOptions()
+    mapping.num_threads = jobs
+    found = pycolmap.global_mapping(database, images, models, mapping)
+    marks.append(time.perf_counter())
+    parts = {name: after - before for name, (before, after) in zip(_PEER_STAGES, pairwise(marks), strict=True)}
+    oriented = max((model.num_reg_images() for model in found.values()), default=0)
+    print(json.dumps({"oriented": oriented, "stages": parts}), flush=True)
+
+
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def rows_of(args: argparse.Namespace, known: Sequence[Row]) -> Iterator[Row]:
+    """A row per scene, size and chain; those that are known are not made again."""
+    counts = args.images * len(args.megapixels) if len(args.images) == 1 else args.images
+    for scene in args.scenes:
+        for megapixels, images in zip(args.megapixels, counts, strict=True):
+            for chain in args.chains:
+                head = {"scene": scene, "megapixels": megapixels, "images": images, "chain": chain}
+                head |= {"keypoints": args.keypoints, "jobs": args.jobs, "seed": args.seed}
+                found = next((row for row in known if head.items() <= row.items()), None)
+                if found is None:
+                    block = block_of(args, scene, megapixels, images)
+                    folder = args.out / f"{scene}-{megapixels}-{chain}"
+                    made = peer_chain(args, block, folder) if chain == PEER else our_chain(args, block, chain, folder)
+                    found = head | made
+                yield found
+
+
+def table_of(rows: Sequence[Row]) -> str:
+    """A line per row; ratios of processor seconds to `baseline` and to pycolmap on the same block."""
+    heads = ("scene", "megapixels", "chain", "oriented", "wall, s", "processor, s", "x `baseline`", "x pycolmap")
+    lines = []
+    for row in rows:
+        same = {other["chain"]: other for other in rows if all(other[k] == row[k] for k in ("scene", "megapixels"))}
+        beside = [
+            factor(ratio(row["processor_seconds"], same[name]["processor_seconds"])) if name in same else "-"
+            for name in ("baseline", PEER)
+        ]
+        shares = [row["stages"].get(stage, 0.0) / row["seconds"] for stage in STAGES]
+        cells = [percent(share) if share else "-" for share in [*shares, 1.0 - sum(shares)]]
+        seconds = number(row["seconds"]), number(row["processor_seconds"])
+        oriented = f"{row['oriented']} of {row['images']}"
+        lines.append(
+            (row["scene"], row["megapixels"], code(row["chain"]), oriented, *seconds, *beside,
+             number(row["peak_mb"]), *cells)
+        )  # fmt: skip
+    return markdown((*heads, "peak, MB", *STAGES, "rest"), lines)
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = options.make_parser("speed", __doc__)
+    add = parser.add_argument
+    add("--images", type=options.numbers, default="24,12", help="of each block: one number, or one for each size")
+    add("--megapixels", type=options.numbers, default="3,12", help="comma-separated")
+    add("--scenes", type=options.names, default=",".join(SCENES), help="comma-separated")
+    add("--chains", type=options.names, default=",".join(CHAINS), help="presets and pycolmap, comma-separated")
+    add("--keypoints", type=options.positive, default=8000, help="SIFT keypoints per image, of all chains")
+    add("--keep", action="store_true", help="leave the workspaces in OUT")
+    add("--seed", type=int, default=64)
+    add("--jobs", type=options.positive, default=2)
+    options.add_output(parser)
+    args = options.parse(parser, arguments, {"images": "6", "megapixels": "1", "keypoints": 2000})
+    if len(args.images) not in (1, len(args.megapixels)):
+        parser.error("--images: give one number, or one for each of --megapixels")
+    args.out.mkdir(parents=True, exist_ok=True)
+    kept = args.out / "speed.json"
+    rows: list[Row] = []
+    for row in rows_of(args, _json(kept) if kept.is_file() else []):
+        rows.append(row)
+        write_rows(kept, rows)
+        print(json.dumps(row), file=sys.stderr, flush=True)
+    presets = [chain for chain in args.chains if chain != PEER]
+    options.publish(
+        args, table_of(rows) + "\n", args.out / "speed.md", table="bench_speed_runs",
+        command=options.command_line(parser, args), versions=stamps.of_whole_runs(*(load(name) for name in presets)),
+    )  # fmt: skip
