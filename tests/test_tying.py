@@ -11,7 +11,7 @@ from test_orientation import CAMERA, flight, limits, matches
 from aeromatch_cli.data import Pose
 from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.sfm.epipolar_agreement import PairPoints
-from aeromatch_cli.sfm.pair_registration import tied_by_pairs
+from aeromatch_cli.sfm.pair_registration import tied_by_ground, tied_by_pairs
 
 LAST = "i23"
 
@@ -81,3 +81,32 @@ def test_what_was_tied_ties_the_next() -> None:
     assert {i: anchor for i, (_, anchor) in found.items()} == {"i01": "i00", "i02": "i01", "i03": "i02"}
     for image_id, (pose, _) in found.items():
         assert angle_between_deg(pose.world_rotation, truth[image_id].world_rotation) < 1.0
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_without_a_position_the_ground_beside_tells_the_distance(turned: bool) -> None:
+    truth = flight()
+    pairs = one_pair_each(truth)
+    if turned:
+        p = pairs[-1]
+        pairs[-1] = PairPoints(p.image_id1, p.image_id0, p.points1_px, p.points0_px, p.indices[:, ::-1])
+    known = {i: pose for i, pose in truth.items() if i != LAST}
+    cameras, thresholds = limits(truth)
+    found = tied_by_ground(pairs, known, dict.fromkeys(cameras, CAMERA), thresholds)
+    pose, anchor = found[LAST]
+    way_m = truth[LAST].center_m - truth[anchor].center_m
+    off_m = pose.center_m - truth[LAST].center_m
+    assert pose.world_rotation is not None
+    assert angle_between_deg(pose.world_rotation, truth[LAST].world_rotation) < 0.5
+    assert np.linalg.norm(off_m) < 0.05 * np.linalg.norm(way_m)
+    assert np.linalg.norm(off_m) < 3.0 * pose.sigma_position_m
+
+
+def test_the_ground_ties_nothing_where_no_other_pair_shows_it() -> None:
+    truth = flight()
+    pairs = one_pair_each(truth)
+    known = {i: pose for i, pose in truth.items() if i != LAST}
+    cameras, thresholds = limits(truth)
+    anchor = next(i for i in (pairs[-1].image_id0, pairs[-1].image_id1) if i != LAST)
+    alone = [p for p in pairs[:-1] if anchor not in (p.image_id0, p.image_id1)] + pairs[-1:]
+    assert tied_by_ground(alone, known, dict.fromkeys(cameras, CAMERA), thresholds) == {}

@@ -60,6 +60,9 @@ class OrientResult(StageResult):
     corrected: list[str] = Field([], description="Images whose given poses were replaced by resection.")
     models: list[MappedModel] = Field([], description="The mapper's models, the largest first.")
     by_one_pair: list[str] = Field([], description="Images oriented by their position and a single pair.")
+    by_ground: list[str] = Field(
+        [], description="Images oriented by a single pair and the height of the ground beside; none has a position."
+    )
     calibrated: list[str] = Field([], description="Cameras whose focal length was found.")
     points: int = Field(description="Points that the terrain was made from.")
     wrong_attitudes: dict[str, float] = Field(description="Image -> degrees off.")

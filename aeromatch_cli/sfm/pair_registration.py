@@ -1,10 +1,13 @@
-"""Poses of images that the model lacks: by a pair and the given position, or as their strip predicts them.
+"""Poses of images that the model lacks: by a pair and the given position or the ground, or as their strip predicts
+them.
 
 An image may hang on the oriented block by pairs without keypoints in common with others.
 
 A pair tells the attitude of the second image and the direction to it, not the distance: mappers put such images
-anywhere along that direction. The given position tells the distance. Blocks that need it: every 2nd and every 3rd image
-of lewis with positions (2 of 16 and 1 of 11 images).
+anywhere along that direction. The given position tells the distance; blocks that need it: every 2nd and every 3rd image
+of lewis with positions (2 of 16 and 1 of 11 images). Without a position the ground does: what the pair shows of it is
+about as high as what the block shows beside it. Blocks that need it: every 4th image of seneca and of lewis without
+positions (1 of 7 and 1 of 8).
 """
 
 from __future__ import annotations
@@ -17,8 +20,8 @@ import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, PairGeometry, Pose
 from aeromatch_cli.geometry.rotations import angle_between_deg
-from aeromatch_cli.geometry.two_view import Sampling, estimate, undistorted
-from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, PairPoints, explained_share
+from aeromatch_cli.geometry.two_view import Sampling, TwoView, estimate, undistorted
+from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, PairPoints, explained_share, triangulated
 
 # Fewer matches do not tell an attitude.
 _LEAST_MATCHES = 30
@@ -30,6 +33,12 @@ _NEAREST = 0.5
 _SLACK = 3.0
 # Standard deviation of the attitude, degrees.
 _SIGMA_DEG = 1.0
+# The height of the ground beside tells the distance: by the nearest third of the pair's matches, so many at least,
+# where they agree to this share (median deviation). The ground beside a match is as high as so many points in the
+# median.
+_NEAREST_SHARE, _FEWEST_NEAREST, _MOST_SCATTER, _BESIDE = 0.33, 12, 0.15, 12
+# The ground need not go on level from one to the other.
+_LEAST_SCATTER = 0.05
 # An image between two oriented ones of its strip is as they are; where these differ by more, the flight turned there.
 _TURN_DEG = 30.0
 # An aircraft's attitude changes by so much from one image to the next.
@@ -64,6 +73,85 @@ def tied_by_pairs(
             found[best.image_id1] = pose, best.image_id0
 
 
+def tied_by_ground(
+    pairs: Sequence[PairPoints],
+    known: Mapping[str, Pose],
+    cameras: Mapping[str, Camera],
+    thresholds_px: Mapping[str, float],
+) -> dict[str, tuple[Pose, str]]:
+    """Return poses of further images without positions, and the image that each was tied to.
+
+    known: oriented images of one model, z upwards. Arguments otherwise as of `tied_by_pairs`.
+    """
+    poses = dict(known)
+    found: dict[str, tuple[Pose, str]] = {}
+    left = [p for p in pairs if len(p.indices) >= _LEAST_MATCHES and not {p.image_id0, p.image_id1} <= poses.keys()]
+    left.sort(key=lambda p: -len(p.indices))
+    inside = [p for p in pairs if {p.image_id0, p.image_id1} <= poses.keys()]
+    while True:
+        anywhere = {i: poses[i] for p in left for i in (p.image_id0, p.image_id1) if i in poses}
+        wanted = {i: Pose(np.zeros(3), None, 0.0, 0.0) for p in left for i in (p.image_id0, p.image_id1)}
+        best = _best_tie(left, anywhere, {i: pose for i, pose in wanted.items() if i not in poses})
+        if best is None:
+            return found
+        left = [p for p in left if {p.image_id0, p.image_id1} != {best.image_id0, best.image_id1}]
+        pose = _on_ground(best, inside, poses, cameras, thresholds_px)
+        if pose is not None:
+            poses[best.image_id1] = pose
+            found[best.image_id1] = pose, best.image_id0
+            inside.append(best)
+
+
+def _on_ground(
+    pair: PairPoints,
+    inside: Sequence[PairPoints],
+    poses: Mapping[str, Pose],
+    cameras: Mapping[str, Camera],
+    thresholds_px: Mapping[str, float],
+) -> Pose | None:
+    """Return the pose of the second image by the height of the ground that the first one shows in pairs `inside`."""
+    known = poses[pair.image_id0]
+    seen = [p for p in inside if pair.image_id0 in (p.image_id0, p.image_id1)]
+    points_m = np.concatenate([np.zeros((0, 3)), *triangulated(seen, poses, cameras)])
+    points_m = points_m[np.isfinite(points_m).all(axis=1)]
+    view = _relative(pair, cameras, thresholds_px)
+    if view is None or view.rotation is None or len(points_m) < _FEWEST_NEAREST:
+        return None
+    assert known.world_rotation is not None
+    rotation = view.rotation @ known.world_rotation
+    for direction in _directions(view.model, view.rotation, known.world_rotation):
+        unit_m = Pose(known.center_m + direction, rotation, 0.0, _SIGMA_DEG)
+        both = {pair.image_id0: known, pair.image_id1: unit_m}
+        limits_px = {i: _SLACK * thresholds_px[i] for i in both}
+        if explained_share(pair, both, cameras, limits_px) < EXPLAINED_SHARE:
+            continue
+        distance_m, scatter = _by_height(triangulated([pair], both, cameras)[0], points_m, known.center_m)
+        if distance_m > 0.0 and scatter <= _MOST_SCATTER:
+            sigma_m = max(scatter, _LEAST_SCATTER) * distance_m
+            return replace(unit_m, center_m=known.center_m + distance_m * direction, sigma_position_m=sigma_m)
+    return None
+
+
+def _by_height(unit_m: FloatArray, points_m: FloatArray, center_m: FloatArray) -> tuple[float, float]:
+    """Return the distance between two images and its scatter, as a share of it.
+
+    unit_m: (M, 3) points of the pair with images one metre apart, NaN where the angle is too flat. points_m: (K, 3)
+    points that the first image, at center_m (3,), sees beside them.
+    """
+    from scipy.spatial import cKDTree
+
+    unit_m = unit_m[np.isfinite(unit_m).all(axis=1)] - center_m
+    others_m = points_m - center_m
+    rays, others = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in (unit_m, others_m))
+    if len(rays) < _FEWEST_NEAREST:
+        return 0.0, np.inf
+    apart, nearest = cKDTree(others).query(rays, k=_BESIDE)
+    order = np.argsort(apart[:, -1], kind="stable")[: max(_FEWEST_NEAREST, round(_NEAREST_SHARE * len(rays)))]
+    distances_m = np.median(others_m[nearest[order], 2], axis=1) / unit_m[order, 2]
+    distance_m = float(np.median(distances_m))
+    return distance_m, float(np.median(np.abs(distances_m / distance_m - 1.0))) if distance_m > 0.0 else np.inf
+
+
 def _best_tie(pairs: Sequence[PairPoints], poses: Mapping[str, Pose], given: Mapping[str, Pose]) -> PairPoints | None:
     """Return the first pair of a known and another image, pairs with most matches first; the last by name of several
     alike."""
@@ -92,15 +180,8 @@ def _tied(
 ) -> Pose | None:
     """Pose of the second image, None where its position or the matches contradict it."""
     assert known.world_rotation is not None
-    ends = pair.image_id0, pair.image_id1
-    pair_of_ids = Pair(*ends, np.nan, np.nan, "")
-    geometry = PairGeometry(pair_of_ids, cameras[ends[0]], cameras[ends[1]], None, None, None)
-    points0, points1, _ = undistorted(pair.points0_px, pair.points1_px, geometry)
-    if len(points0) < _LEAST_MATCHES:
-        return None
-    sampling = Sampling(min(thresholds_px[i] for i in ends))
-    view = estimate(points0, points1, geometry, "relative_pose", sampling, 0)
-    if view.rotation is None or view.inliers.sum() < EXPLAINED_SHARE * len(points0):
+    ends, view = (pair.image_id0, pair.image_id1), _relative(pair, cameras, thresholds_px)
+    if view is None or view.rotation is None:
         return None
     rotation = view.rotation @ known.world_rotation
     limits_px = {i: _SLACK * thresholds_px[i] for i in ends}
@@ -113,6 +194,19 @@ def _tied(
         if explained_share(pair, both, cameras, limits_px) >= EXPLAINED_SHARE:
             return pose
     return None
+
+
+def _relative(pair: PairPoints, cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]) -> TwoView | None:
+    """Relative orientation of a pair, None where too few of its matches agree on one."""
+    ends = pair.image_id0, pair.image_id1
+    geometry = PairGeometry(Pair(*ends, np.nan, np.nan, ""), cameras[ends[0]], cameras[ends[1]], None, None, None)
+    points0, points1, _ = undistorted(pair.points0_px, pair.points1_px, geometry)
+    if len(points0) < _LEAST_MATCHES:
+        return None
+    sampling = Sampling(min(thresholds_px[i] for i in ends))
+    view = estimate(points0, points1, geometry, "relative_pose", sampling, 0)
+    held = view.rotation is not None and view.inliers.sum() >= EXPLAINED_SHARE * len(points0)
+    return view if held else None
 
 
 def _directions(model: FloatArray, rotation: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -25,7 +25,7 @@ from aeromatch_cli.sfm.epipolar_agreement import (
 )
 from aeromatch_cli.sfm.mapping import Group, Model
 from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES, SLACK
-from aeromatch_cli.sfm.pair_registration import predicted, tied_by_pairs
+from aeromatch_cli.sfm.pair_registration import predicted, tied_by_ground, tied_by_pairs
 from aeromatch_cli.sfm.pose_prior_check import consistent_images
 from aeromatch_cli.sfm.resection import resected
 
@@ -203,7 +203,10 @@ def from_models(
     loose = {i: pose for i, pose in block.poses.items() if i not in found}
     tied = tied_by_pairs(evidence.pairs, placed, loose, lenses, evidence.thresholds_px)
     found |= {i: pose for i, (pose, _) in tied.items()}
-    groups = _groups_with(models, {i: anchor for i, (_, anchor) in tied.items()})
+    on_ground = _tied_by_ground(evidence, models, found, lenses)
+    found |= {i: pose for i, (pose, _) in on_ground.items()}
+    beside |= on_ground.keys()
+    groups = _groups_with(models, {i: anchor for i, (_, anchor) in (tied | on_ground).items()})
     convention = None if own else _convention(models, angles, block.poses)
     # Given positions are in another frame than one of the pictures' own.
     poses = found if own else {**block.poses, **_loose_poses(evidence, found, convention, angles), **found}
@@ -215,6 +218,7 @@ def from_models(
         frame="own" if own else "world",
         models=[model.figures for model in models],
         by_one_pair=sorted(tied),
+        by_ground=sorted(on_ground),
         calibrated=sorted({k for model in models for k in model.cameras}),
         points=points,
         focal_lengths=_focal_lengths(evidence.stated_cameras, cameras),
@@ -241,6 +245,21 @@ def _of_models(block: Block, models: Sequence[Model], before: Before) -> tuple[d
         if kept:
             cameras |= {k: old for k, old in before.cameras.items() if _same_lens(model.cameras.get(k), old)}
     return cameras, found
+
+
+def _tied_by_ground(
+    evidence: FirstPassMatches, models: Sequence[Model], found: Mapping[str, Pose], lenses: Mapping[str, Camera]
+) -> dict[str, tuple[Pose, str]]:
+    """Return poses of images that a pair ties to a model in a frame of its own, and the image that each is tied to."""
+    tied: dict[str, tuple[Pose, str]] = {}
+    for model in models:
+        if model.kind != "level":
+            continue
+        known = {i: found[i] for i in model.rotations}
+        elsewhere = (found.keys() | tied.keys()) - known.keys()
+        free = [pair for pair in evidence.pairs if elsewhere.isdisjoint((pair.image_id0, pair.image_id1))]
+        tied |= tied_by_ground(free, known, lenses, evidence.thresholds_px)
+    return tied
 
 
 def _north_by_image(models: Sequence[Model], given: Mapping[str, Pose]) -> dict[str, float]:
