@@ -10,12 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aeromatch_cli.stages.pair_statistics import PairStatistics, columns, expected_number, fitted_weights, log_error
-from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows
+from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, Step
 
 MANY = 8000
 # A pair of a nadir block with enough matches.
 USUAL = PairStatistics(700, 0.6, 0.9, 4000, 1200, 20.0)
 STEP = LearnedFeatures(below_matches=600, below_coverage=0.7)
+
+
+class Unforeseen(Step):
+    """A step for which no weights have been found."""
+
+    name: str = "unforeseen"
 
 
 @pytest.mark.parametrize(
@@ -51,7 +57,7 @@ def test_nothing_is_expected_where_overlap_or_angle_are_unknown_or_the_step_has_
     for unknown in ({"overlap": np.nan}, {"overlap": 0.0}, {"angle_deg": np.nan}):
         assert columns(replace(USUAL, **unknown), 4000) is None
         assert np.isnan(replace(USUAL, **unknown).expected(STEP, 4000))
-    assert np.isnan(USUAL.expected(LiftedShadows(), 4000))
+    assert np.isnan(USUAL.expected(Unforeseen(), 4000))
     assert np.isfinite(USUAL.expected(GuidedSearch(), 4000))
 
 
@@ -126,4 +132,4 @@ def test_what_a_lacking_pair_is_expected_to_have_is_said() -> None:
     assert lacking.lacks(STEP) == words
     about = float(f"{lacking.expected(STEP, 4000):.2g}")
     assert lacking.asks_for(STEP, 4000) == f"{words}, about {about:.0f} expected after it"
-    assert lacking.asks_for(LiftedShadows(below_matches=600), 4000) == words
+    assert lacking.asks_for(Unforeseen(below_matches=600), 4000) == words

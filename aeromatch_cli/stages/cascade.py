@@ -27,17 +27,14 @@ from aeromatch_cli.stages.pair_statistics import PairStatistics
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
 from aeromatch_cli.strategies.extractors.described import Described
 from aeromatch_cli.strategies.extractors.learned import Learned
-from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.strategies.matchers.descriptors.search import EVERY_PAIR
-from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
 from aeromatch_cli.strategies.simulators.plane import PlaneViews
-from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows, Step
+from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, Step
 from aeromatch_cli.workspace import Workspace
 
 # The first step of every cascade.
@@ -64,10 +61,10 @@ def keypoints_of(step: Any, settings: Settings) -> int:
     return int((step.keypoints or min(_SLOW_KEYPOINTS, own)) if step.own_features else own)
 
 
-def _reduction(settings: Settings, kind: type[Described]) -> dict[str, float]:
-    """Return the reduction that the user's keypoints of the kind have; others are never reduced where that is set."""
+def _reduction(settings: Settings) -> dict[str, float]:
+    """Return the reduction of learned keypoints: that of the user's own, none where others of the user have none."""
     own = settings.extract
-    taken = isinstance(own, Described) and (isinstance(own, kind) or own.pixels_per_keypoint == 0.0)
+    taken = isinstance(own, Described) and (isinstance(own, Learned) or own.pixels_per_keypoint == 0.0)
     return {"pixels_per_keypoint": own.pixels_per_keypoint} if taken else {}
 
 
@@ -89,15 +86,9 @@ _SETTINGS_OF: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]
             keypoints=keypoints_of(step, settings),
             precision=step.precision,
             device=step.device,
-            **_reduction(settings, Learned),
+            **_reduction(settings),
         ),
         "match": Bidirectional(ratio=0.9, guided=True),
-    },
-    LiftedShadows: lambda step, settings: {
-        "enhance": ShadowEnhancement(),
-        "simulate": _views(settings),
-        "extract": Sift(keypoints=keypoints_of(step, settings), **_reduction(settings, Sift)),
-        "match": LightGlue(guided=True, precision=step.precision, device=step.device),
     },
 }
 

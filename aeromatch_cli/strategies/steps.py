@@ -102,13 +102,4 @@ class LearnedFeatures(Step):
     device: Device = DEVICE
 
 
-class LiftedShadows(Step):
-    """SIFT with shadows lifted, views from the neighbours' directions, LightGlue."""
-
-    name: Literal["shadow"] = "shadow"
-    keypoints: int | None = _KEYPOINTS
-    precision: Precision = _PRECISION
-    device: Device = DEVICE
-
-
-STEPS: Mapping[str, type[Step]] = {"guided": GuidedSearch, "learned": LearnedFeatures, "shadow": LiftedShadows}
+STEPS: Mapping[str, type[Step]] = {"guided": GuidedSearch, "learned": LearnedFeatures}

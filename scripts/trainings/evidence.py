@@ -99,7 +99,7 @@ def with_expected(rows: Sequence[Row]) -> list[Row]:
     return [
         {**row, "expected": expected_number(np.array(row["columns"]), own)}
         for row in rows
-        if (own := weights[row["step"]]) is not None
+        if (own := weights.get(row["step"])) is not None
     ]
 
 
