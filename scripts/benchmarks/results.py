@@ -68,7 +68,8 @@ def main(arguments: Sequence[str]) -> int:
     args = options.parse(parser, arguments)
     if unknown := sorted(set(args.only) - set(STANDING)):
         parser.error(f"--only: {', '.join(unknown)} are none of {', '.join(STANDING)}")
-    given = {"DATA": str(args.data.resolve()), "OUT": str(args.out.resolve() / code_digest("")[:8])}
+    folder = code_digest("")[:8] + ("-quick" if args.quick else "")
+    given = {"DATA": str(args.data.resolve()), "OUT": str(args.out.resolve() / folder)}
     if args.reference_weights:
         given["WEIGHTS"] = str(args.reference_weights.resolve())
     failed = []
