@@ -41,7 +41,7 @@ from benchmarks.tables import Row, write_rows
 METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
 STRATEGIES = (
     "filter=epipolar+graph,filter=clustered-ransac+epipolar,"
-    "consistency.min_probability=0.5,simulate=neighbours,cascade=guided"
+    "match=lightglue,enhance=shadow,simulate=neighbours"
 )
 
 
