@@ -14,6 +14,7 @@ TABLE: Table = {
     "blocks": ("benchmarks.blocks.command", "whole real blocks beside pycolmap: matches, mapping, time"),
     "fusion": ("benchmarks.fusion", "every table of preset fusion: a list of runs of the others"),
     "oblique": ("benchmarks.oblique", "every table of oblique pairs: a list of runs of the others"),
+    "claims": ("benchmarks.claims.command", "the papers' claims beside this project, and ablations, by exact truth"),
     "orient": (
         "benchmarks.orient.command",
         "orientation from the pictures where given poses and cameras are wrong",

@@ -32,6 +32,7 @@ FOLDER = REPOSITORY / "docs" / "results"
 # Table -> page.
 PAGES: Mapping[str, str] = {
     "bench_methods": "methods.md",
+    "bench_claims": "claims.md",
     "bench_presets": "auto.md",
     "bench_presets_second": "auto.md",
     "bench_presets_nothing": "auto.md",
