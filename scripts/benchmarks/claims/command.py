@@ -14,6 +14,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from aeromatch_cli.config import FAMILIES
 from benchmarks import options, stamps
 from benchmarks.claims import features, registration, shadow
 from benchmarks.claims.page import legend, tables
@@ -21,6 +22,7 @@ from benchmarks.claims.work import made, prepare
 from benchmarks.tables import write_rows
 
 JOBS = 2
+QUICK = {"pairs": 2, "size": "1600x1200"}
 
 
 def make_options() -> argparse.ArgumentParser:
@@ -29,27 +31,31 @@ def make_options() -> argparse.ArgumentParser:
     add("--seed", type=int, default=1, help="another seed gives other blocks, grounds, pairs and samples")
     add("--data", type=Path, metavar="DIR", help="folder of real blocks (seneca, caliterra)")
     add("--reference-weights", type=Path, metavar="DIR", help="folder with superpoint_v1.pth, for who has it")
-    options.add_output(parser, tables=2)
+    add("--pairs", type=options.positive, default=8, help="of each rendered block of papers A and C")
+    add("--size", metavar="WxH", default="7360x5400", help="of paper B's pictures with known parameters")
+    options.add_output(parser)
     return parser
 
 
 def main(arguments: Sequence[str]) -> None:
     parser = make_options()
-    args = options.parse(parser, arguments)
+    args = options.parse(parser, arguments, QUICK)
+    seed, pairs, out = args.seed, args.pairs, args.out
     weights = args.reference_weights
     if weights is not None and not (weights / "superpoint_v1.pth").is_file():
         weights = None
-    parts = shadow, registration, features
-    prepare([scene for part in parts for scene in part.scenes(args.seed, args.out)], JOBS)
+    scenes = [*shadow.scenes(seed, pairs, out), *features.scenes(seed, pairs, out), *registration.scenes(seed, out)]
+    prepare(scenes, JOBS)
     units = [
-        *shadow.units(args.seed, args.out),
-        *features.units(args.seed, weights, args.out),
-        *registration.units(args.seed, args.data, args.out),
+        *shadow.units(seed, pairs, out),
+        *features.units(seed, pairs, weights, out),
+        *registration.units(seed, options.size_px(args.size), args.data, out),
     ]
-    rows = made(units, args.out / "rows", JOBS)
-    write_rows(args.out / "claims.json", rows)
-    text = f"Seed {args.seed}. {legend()}\n\n{tables(rows)}"
-    versions = stamps.of_settings(*(one for part in parts for one in part.settings()))
+    rows = made(units, out / "rows", JOBS)
+    write_rows(out / "claims.json", rows)
+    text = f"Seed {seed}. {legend()}\n\n{tables(rows)}"
+    settings = [one for part in (shadow, registration, features) for one in part.settings()]
+    versions = stamps.of_settings(*settings, families=[family for family in FAMILIES if family != "export"])
     options.publish(
         args, text, args.out / "claims.md", table="bench_claims", command=options.command_line(parser, args),
         versions=versions,

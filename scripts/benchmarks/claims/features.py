@@ -29,7 +29,7 @@ from benchmarks.tables import Row, plain
 
 CODE = (*OUR_CODE, *PEER_CODE, "lab/synthetic", "evaluate", "benchmarks/claims/features.py")
 SCENES = ("city", "hills")
-SIZE, IMAGES, PAIRS, KEYPOINTS = "800x600", 20, 16, 2048
+SIZE, IMAGES, KEYPOINTS = "800x600", 20, 2048
 OBLIQUE_DEG = 40.0
 _AS_TAKEN = "simulate=none,match.guided=false"
 SUPERPOINT, STEP, RECTIFIED, WHOLE = "SuperPoint", "learned features", "SIFT on rectified views", "oblique"
@@ -45,33 +45,34 @@ RATIOS = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
 TWO_WAY, ONE_WAY = "two-way", "one-way"
 
 
-def units(seed: int, weights: Path | None, out: Path) -> list[Unit]:
+def units(seed: int, pairs: int, weights: Path | None, out: Path) -> list[Unit]:
     asked = {name: spec for name, spec in {**RIVALS, **OURS}.items() if spec not in NEED_WEIGHTS or weights}
     found = [
-        Unit(f"{scene}: {name}", rows_of, (scene, name, spec, seed, weights, out), CODE)
+        Unit(f"{scene}: {name}", rows_of, (scene, name, spec, seed, pairs, weights, out), CODE)
         for scene in SCENES
         for name, spec in asked.items()
     ]
-    return found + [Unit(f"{scene}: ratio test", ratio_rows, (scene, seed, out), CODE) for scene in SCENES]
+    return found + [Unit(f"{scene}: ratio test", ratio_rows, (scene, seed, pairs, out), CODE) for scene in SCENES]
 
 
 def settings() -> list[Settings]:
     return [load(*parse_method(spec)) for spec in (*RIVALS.values(), *OURS.values()) if spec not in PEERS]
 
 
-def scenes(seed: int, out: Path) -> list[tuple[object, ...]]:
+def scenes(seed: int, pairs: int, out: Path) -> list[tuple[object, ...]]:
     """Arguments of `work.rendered`."""
-    return [(scene, "oblique", SIZE, IMAGES, PAIRS, "angles", seed, out) for scene in SCENES]
+    return [(scene, "oblique", SIZE, IMAGES, 2 * pairs, "angles", seed, out) for scene in SCENES]
 
 
-def _oblique(scene: str, seed: int, out: Path) -> tuple[Judged, list[JudgedPair]]:
-    """A block of a five-camera rig, and those of its pairs that differ by 40 degrees or more."""
-    judged = rendered(scene, "oblique", SIZE, IMAGES, PAIRS, "angles", seed, out)
+def _oblique(scene: str, seed: int, pairs: int, out: Path) -> tuple[Judged, list[JudgedPair]]:
+    """A block of a five-camera rig, and those of its pairs that differ by 40 degrees or more: half of them, where it
+    has as many."""
+    judged = rendered(scene, "oblique", SIZE, IMAGES, 2 * pairs, "angles", seed, out)
     return judged, [pair for pair in judged.pairs if pair.conditions.view_angle_deg >= OBLIQUE_DEG]
 
 
-def rows_of(scene: str, name: str, spec: str, seed: int, weights: Path | None, out: Path) -> list[Row]:
-    judged, pairs = _oblique(scene, seed, out)
+def rows_of(scene: str, name: str, spec: str, seed: int, count: int, weights: Path | None, out: Path) -> list[Row]:
+    judged, pairs = _oblique(scene, seed, count, out)
     asked = method(spec)(judged.scene, Options(KEYPOINTS, "image", 1, seed, weights))
     known = {image: asked.features(image) for image in sorted({image for pair in pairs for image in pair.images})}
     rows = []
@@ -85,9 +86,9 @@ def rows_of(scene: str, name: str, spec: str, seed: int, weights: Path | None, o
     return rows
 
 
-def ratio_rows(scene: str, seed: int, out: Path) -> list[Row]:
+def ratio_rows(scene: str, seed: int, count: int, out: Path) -> list[Row]:
     """The ratio test from either image and from one, on the features of the preset, before and after one filter."""
-    judged, pairs = _oblique(scene, seed, out)
+    judged, pairs = _oblique(scene, seed, count, out)
     preset = Preset(
         judged.scene, Options(KEYPOINTS, "image", 1, seed, None), preset="oblique", settings=("match.guided=false",)
     )

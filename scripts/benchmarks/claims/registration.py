@@ -29,7 +29,7 @@ CODE = (
     "strategies/matchers/polar", "strategies/extractors/grid.py", "geometry", "images",
     "benchmarks/claims/registration.py", "benchmarks/claims/grounds.py", "benchmarks/claims/sides.py",
 )  # fmt: skip
-SIZE, PAIRS = (7360, 5400), 2
+PAIRS = 2
 RENDERED, REAL = ("grass", "farmland"), ("seneca", "caliterra")
 UNKNOWN_SIZE, UNKNOWN_IMAGES, UNKNOWN_PAIRS = "1840x1350", 5, 4
 GRID_SIZE, GRID_PAIRS, SAMPLES = (1840, 1350), 12, 20_000
@@ -40,20 +40,21 @@ _VERIFIED = 30  # matches of SIFT's that a comparison with it rests on
 _MOSTLY = 0.8
 
 
-def units(seed: int, data: Path | None, out: Path) -> list[Unit]:
+def units(seed: int, size: tuple[int, int], data: Path | None, out: Path) -> list[Unit]:
     grids = [Unit(f"grids, {kind}", grid_rows, (kind, seed), CODE) for kind in GROUNDS]
     kinds, code = (*RENDERED, *(REAL if data else ())), (*CODE, "lab/synthetic")
     unknown = [Unit(f"unknown, {kind}", unknown_rows, (kind, seed, data, out), code) for kind in kinds]
-    return grids + unknown + [Unit(f"known, {kind}", known_rows, (kind, seed), CODE, alone=True) for kind in GROUNDS]
+    known = [Unit(f"known, {kind}", known_rows, (kind, size, seed), CODE, alone=True) for kind in GROUNDS]
+    return grids + unknown + known
 
 
 def settings() -> list[Settings]:
     return [load("polar")]
 
 
-def known_rows(kind: str, seed: int) -> list[Row]:
-    source = ground(kind, SIZE, seed)
-    return [_known(known_pair(source, SIZE, np.random.default_rng([seed, 5, n])), kind, n) for n in range(PAIRS)]
+def known_rows(kind: str, size: tuple[int, int], seed: int) -> list[Row]:
+    source = ground(kind, size, seed)
+    return [_known(known_pair(source, size, np.random.default_rng([seed, 5, n])), kind, n) for n in range(PAIRS)]
 
 
 def _known(pair: KnownPair, kind: str, number: int) -> Row:

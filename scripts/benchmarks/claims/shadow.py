@@ -38,7 +38,7 @@ from benchmarks.tables import Row
 
 CODE = (*OUR_CODE, "lab/synthetic", "evaluate", "benchmarks/claims/shadow.py")
 SCENES = ("city", "suburb")
-SIZE, IMAGES, PAIRS, KEYPOINTS = "800x600", 12, 8, 2048
+SIZE, IMAGES, KEYPOINTS = "800x600", 12, 2048
 _MATCHER = (
     "match.guided=false,match.only_overlap=false,match.network_below_matches=100000,match.guide_below_matches=100000"
 )
@@ -70,14 +70,14 @@ UNDER_EXPOSED = 0.06
 _STREAM = 211
 
 
-def units(seed: int, out: Path) -> list[Unit]:
+def units(seed: int, pairs: int, out: Path) -> list[Unit]:
     found = []
     for scene in SCENES:
         for dark in (False, True):
             arms = {name: ARMS[name] for name in (DARK_ARMS if dark else ARMS)}
             for name, spec in {**arms, **EXPONENTS}.items():
                 label = f"{scene}{', under-exposed' if dark else ''}: {name}"
-                found.append(Unit(label, rows_of, (scene, dark, name, spec, seed, out), CODE))
+                found.append(Unit(label, rows_of, (scene, dark, name, spec, seed, pairs, out), CODE))
     return found
 
 
@@ -85,14 +85,14 @@ def settings() -> list[Settings]:
     return [load(*parse_method(spec)) for spec in (*ARMS.values(), *EXPONENTS.values())]
 
 
-def scenes(seed: int, out: Path) -> list[tuple[object, ...]]:
+def scenes(seed: int, pairs: int, out: Path) -> list[tuple[object, ...]]:
     """Arguments of `work.rendered`."""
-    return [(scene, "mixed", SIZE, IMAGES, PAIRS, "hard", seed, out) for scene in SCENES]
+    return [(scene, "mixed", SIZE, IMAGES, pairs, "hard", seed, out) for scene in SCENES]
 
 
-def scene_of(scene: str, seed: int, out: Path, *, dark: bool = False) -> Judged:
+def scene_of(scene: str, seed: int, pairs: int, out: Path, *, dark: bool = False) -> Judged:
     """Hard pairs of a block of two sorties with two suns; rendered unless it is there."""
-    judged = rendered(scene, "mixed", SIZE, IMAGES, PAIRS, "hard", seed, out)
+    judged = rendered(scene, "mixed", SIZE, IMAGES, pairs, "hard", seed, out)
     return under_exposed(judged, seed) if dark else judged
 
 
@@ -137,9 +137,9 @@ class Given:
     chain: tuple[Any, ...]
 
 
-def rows_of(scene: str, dark: bool, arm: str, spec: str, seed: int, out: Path) -> list[Row]:
+def rows_of(scene: str, dark: bool, arm: str, spec: str, seed: int, pairs: int, out: Path) -> list[Row]:
     """Of one arm on one scene: a row for every pair and chain of filters."""
-    judged = scene_of(scene, seed, out, dark=dark)
+    judged = scene_of(scene, seed, pairs, out, dark=dark)
     rows = []
     for pair, given in _given(judged, spec, seed):
         suns = len({judged.truth.truth.sorties[name] for name in pair})
