@@ -135,13 +135,12 @@ def test_real_lenses_are_one_to_one_and_exif_knows_their_focal_length() -> None:
 def test_the_command_keeps_its_rows_and_colmap_is_better_with_a_free_principal_point(tmp_path: Path) -> None:
     arguments = [
         "--scenes", "grass", "--flights", "cross", "--images", "12", "--positions", "rtk2cm", "--seeds", "1",
-        "--points", "200", "--peers", "colmap,colmap-opencv,colmap-priors", "--jobs", "1", "--out", str(tmp_path),
+        "--points", "200", "--peers", "colmap,colmap-opencv", "--jobs", "1", "--out", str(tmp_path),
     ]  # fmt: skip
     main(arguments)
     rows = {row["method"]: row for row in map(read_json, (tmp_path / "rows").iterdir())}
-    assert len(rows) == 4
+    assert len(rows) == 3
     assert rows["colmap-opencv"]["centre_px"] < 0.5 * rows["colmap"]["centre_px"]
-    assert rows["colmap-priors"]["absolute_height_px"] < 10.0
     times = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "rows").iterdir()}
     main(arguments)
     assert times == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "rows").iterdir()}

@@ -7,26 +7,29 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from benchmarks.growth import STAGES, draw_growth, table_of, write_block
-from benchmarks.memory import peak_mb
+from benchmarks.growth import STAGES, table_of, write_block
+from benchmarks.processes import run_watched
 
 
-def test_exponents_are_those_of_the_number_of_images(tmp_path: Path) -> None:
+def test_exponents_are_those_of_the_number_of_images() -> None:
     rows = [
         {
-            "images": images, "run": run, "seconds": seconds, "peak_mb": 200.0, "pairs": 10 * images, "report_mb": 1.0,
-            "processor_seconds": seconds, "workspace_mb": 2.0 * images,
+            "images": images, "repeat": repeat, "run": run, "seconds": seconds, "peak_mb": 200.0, "pairs": 10 * images,
+            "report_mb": 1.0, "processor_seconds": seconds + repeat, "workspace_mb": 2.0 * images,
             "stages": dict.fromkeys(STAGES, (images / 100.0) ** 2),
         }
-        for images in (100, 1000)
+        for images, repeats in ((100, 3), (1000, 1))
+        for repeat in range(repeats)
         for run, seconds in (("run", images / 10.0), ("again", 5.0))
     ]  # fmt: skip
-    draw_growth(tmp_path / "growth.svg", rows)
-    assert "n log n" in (tmp_path / "growth.svg").read_text(encoding="utf-8")
-    lines = {line.split("|")[1].strip(): line for line in table_of(rows).splitlines()}
-    assert "| 1.0 | 100 (2.00) |" in lines["match, s"]
-    assert "| 10.0 | 100 (1.00) |" in lines["whole run, s"]
-    assert "| 5.0 | 5.0 (0.00) |" in lines["again, s"]
+    text = table_of(rows)
+    assert text.splitlines()[0] == "|  | 100 images | 1000 images | exponent to 1000 |"
+    lines = {line.split("|")[1].strip(): line for line in text.splitlines()}
+    assert lines["runs"] == "| runs | 3 | 1 |  |"
+    assert lines["match, s"] == "| match, s | 1.0 (1.0 to 1.0) | 100 | 2.00 |"
+    assert lines["whole run, s"] == "| whole run, s | 10.0 (10.0 to 10.0) | 100 | 1.00 |"
+    assert lines["processor, s"] == "| processor, s | 11.0 (10.0 to 12.0) | 100 | 0.96 |"
+    assert lines["again, s"] == "| again, s | 5.0 (5.0 to 5.0) | 5.0 | 0.00 |"
 
 
 def test_neighbours_of_a_block_share_their_ground(tmp_path: Path) -> None:
@@ -41,7 +44,7 @@ def test_neighbours_of_a_block_share_their_ground(tmp_path: Path) -> None:
 def test_memory_of_a_process_and_its_child_is_summed(tmp_path: Path) -> None:
     child = "import time; held = bytearray(60 << 20); time.sleep(0.6)"
     text = f"import subprocess, sys; held = bytearray(90 << 20); subprocess.run([sys.executable, '-c', {child!r}])"
-    code, seconds, peak = peak_mb([sys.executable, "-c", text], tmp_path / "log")
+    code, seconds, peak = run_watched([sys.executable, "-c", text], tmp_path / "log")
     assert code == 0
     assert seconds > 0.6
     assert 150.0 < peak < 200.0

@@ -1,4 +1,4 @@
-"""Pictures and folders as people have them, rebuilt after public reports: docs/results/field_cases.md names the source
+"""Pictures and folders as people have them, rebuilt after public reports: docs/field_cases.md names the source
 of each."""
 
 from __future__ import annotations

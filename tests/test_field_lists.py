@@ -1,4 +1,4 @@
-"""Lists as people have them, rebuilt after public reports: docs/results/field_cases.md names the source of each."""
+"""Lists as people have them, rebuilt after public reports: docs/field_cases.md names the source of each."""
 
 from __future__ import annotations
 
@@ -316,7 +316,7 @@ def test_names_of_images_in_another_case(tmp_path: Path) -> None:
 
 def test_the_page_of_the_cases_names_tests_that_exist() -> None:
     folder = Path(__file__).parent
-    page = (folder.parent / "docs" / "results" / "field_cases.md").read_text(encoding="utf-8")
+    page = (folder.parent / "docs" / "field_cases.md").read_text(encoding="utf-8")
     own = "".join((folder / f"test_field_{kind}.py").read_text(encoding="utf-8") for kind in ("lists", "images"))
     named = re.findall(r"(?:`(test_\w+\.py)`: )?\b(test_\w+)\b(?!\.py)", page)
     assert len(named) > 60

@@ -7,6 +7,7 @@ import tomllib
 
 import pytest
 import typer
+from benchmarks import figures, pages
 from read_pages import PAGES, ROOT, text_of
 
 from aeromatch_cli.cli import app, weights_app
@@ -47,6 +48,24 @@ def test_every_dependency_has_its_reason() -> None:
     named = {name.strip() for cell in reasons for name in cell.split(",")} - {"package"}
     assert names == named
     assert all(len(reason.split()) > 1 for cell, reason in reasons.items() if cell not in ("package", "numpy"))
+
+
+def test_results_are_those_of_the_tables() -> None:
+    assert figures.with_results(README) == README, "scripts/bench results --docs mends it"
+    assert README.count("| `scripts/bench ") == len(figures.RESULTS) == 4
+    for result in figures.RESULTS:
+        for figure in result.figures.values():
+            pages.page_of(figure.table)  # raises where there is none
+
+
+def test_a_figure_is_the_cell_of_one_line() -> None:
+    text = "words\n\n| a | b | c |\n|---|---|---|\n| x | 1 | 2.5 (2 to 3) |\n| y | 1 | 4 |\n| y | 2 | 5 |"
+    assert figures.read(figures.Figure("t", "c", {"a": "x"}), text) == "2.5 (2 to 3)"
+    assert figures.read(figures.Figure("t", "c", {"a": "y", "b": "2"}), text) == "5"
+    assert figures.read(figures.Figure("t", "c", {"a": "x"}), "") == ""
+    for wrong in (figures.Figure("t", "c", {"a": "y"}), figures.Figure("t", "d", {"a": "x"})):
+        with pytest.raises(ValueError, match="t has"):
+            figures.read(wrong, text)
 
 
 def test_the_readme_is_short() -> None:

@@ -2,7 +2,7 @@
 neighbours, and which matches are probable enough to stay.
 
 A logistic model of a few properties that every match has. It was fitted on rendered blocks, whose truth is exact;
-`scripts/bench probability` fits it again and draws how far it can be relied on, on blocks that it has not seen.
+`scripts/train probability` fits it again and says how far it can be relied on, on blocks that it has not seen.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LOOSE, _LEAST_LOOSE_PX = 1.5, 1.0
 _NOWHERE_PX = 16.0
 # Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
-# One for every column of `columns`, as `scripts/bench probability` has found them.
+# One for every column of `columns`, as `scripts/train probability` has found them.
 WEIGHTS = (4.818, 2.247, 1.148, -0.732, -1.268, -3.094)
 # Matches left to a pair without which images fall apart: enough for a relative orientation, few among all others.
 _BRIDGING = 30

@@ -1,7 +1,7 @@
 """Pair statistics: what steps of a cascade have found of a pair, what it lacks, and what a further step may find.
 
 The logarithm of the expected number is linear in those of what is known. The weights are the steps' own, found on
-rendered blocks by `scripts/bench evidence`, which draws how far they hold on others. Coverage, candidates and
+rendered blocks by `scripts/train evidence`, which says how far they hold on others. Coverage, candidates and
 what the pairs of the same images have found say nothing that matches, keypoints, overlap and view angle do not say.
 """
 

@@ -40,7 +40,7 @@ class Step(Strategy):
     own_features: it finds keypoints of its own, else it uses those of the first step, and what it finds replaces that
     step's matches. cheap_to_match: pairs take the step, too, whose images are both looked at for other pairs.
     expectation_weights: by which `stages.pair_statistics` expects how many matches a pair has after the step, as
-    `scripts/bench evidence` has found them; None: nothing is expected.
+    `scripts/train evidence` has found them; None: nothing is expected.
     """
 
     own_features: ClassVar[bool] = True

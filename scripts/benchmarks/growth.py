@@ -1,12 +1,13 @@
 """How seconds and memory of every stage grow with the number of images.
 
 Blocks of small images are cut from one made texture, as a level camera above a plane sees it, in strips with 70 % and
-60 % overlap; poses and camera are exact. `run`: the whole command; `again`: the same command on the finished workspace.
-Memory: the largest sum of what the command's processes hold (PSS), looked at every 0.2 s. Exponent: of the power of the
-number of images by which the seconds grow from one block to the next. Processor: seconds of all processes together,
-which other work on the machine hardly changes.
+60 % overlap; poses and camera are exact. Whole run: the command from an empty folder; again: the same command on the
+finished workspace. Memory: the largest sum of what the command's processes hold (PSS), looked at every 0.2 s. Medians
+of --repeats runs, in brackets their 90 % interval. Exponent: of the power of the number of images by which a figure
+grows from one block to the next. Processor: seconds of all processes together, which other work on the machine hardly
+changes.
 
-Writes OUT/growth.json, OUT/growth.md and OUT/growth.svg. Whole rows that OUT has are not made again.
+Writes OUT/growth.json and OUT/growth.md. Whole rows that OUT has are not made again.
 """
 
 from __future__ import annotations
@@ -15,20 +16,33 @@ import json
 import math
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from benchmarks import options, stamps
-from benchmarks.memory import peak_mb, texture
-from benchmarks.pages import FOLDER
-from benchmarks.processes import children_seconds
-from benchmarks.tables import Row, markdown, number, write_rows
+from benchmarks.processes import children_seconds, run_watched
+from benchmarks.tables import Row, interval, markdown, medians, number, ranged, values, write_rows
 
 _WIDTH, _HEIGHT, _FOCAL, _GSD_M = 160, 120, 200.0, 0.5
 _STEP_X, _STEP_Y = 48, 48
-_SIZE_IN = (7.5, 5.0)
 STAGES = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "consistency", "export", "report")
+
+
+def texture(width_px: int, height_px: int, seed: int) -> NDArray[np.uint8]:
+    """Ground that has structure at every scale: sums of enlarged noise."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    found = np.full((height_px, width_px), 128.0, np.float32)
+    for cell_px, contrast in ((3, 20.0), (9, 25.0), (40, 25.0), (400, 20.0)):
+        small = rng.standard_normal((height_px // cell_px + 2, width_px // cell_px + 2)).astype(np.float32)
+        found += contrast * cv2.resize(small, (width_px, height_px), interpolation=cv2.INTER_CUBIC)
+    return np.clip(found, 0, 255).astype(np.uint8)
 
 
 def write_block(folder: Path, images: int, seed: int) -> None:
@@ -56,34 +70,38 @@ def write_block(folder: Path, images: int, seed: int) -> None:
 
 
 def rows_of(args: Any, known: Sequence[Row]) -> Iterator[Row]:
-    """Two rows per block, those that are known first."""
-    for images in args.images:
-        if len(before := [row for row in known if row["images"] == images]) == 2:
-            yield from before
-            continue
-        folder, work = args.out / f"block-{images}", args.out / f"work-{images}"
+    """Two rows for every block and repeat, those that are known first."""
+    for images, repeats in zip(args.images, args.repeats, strict=True):
+        folder = args.out / f"block-{images}"
         write_block(folder, images, args.seed)
-        shutil.rmtree(work, ignore_errors=True)
-        command = [sys.executable, "-m", "aeromatch_cli.cli", "run", args.preset, "--quiet", "--json"]
-        command += ["--images", str(folder / "images"), "--poses", str(folder / "poses.csv")]
-        command += ["--cameras", str(folder / "cameras.json"), "--ground", "0", "--crs", "local"]
-        command += ["--workspace", str(work), "--jobs", str(args.jobs), "--set", f"extract.keypoints={args.keypoints}"]
-        for run in ("run", "again"):
-            log, used_s = args.out / f"{run}-{images}.log", children_seconds()
-            exit_code, seconds, peak = peak_mb(command, log)
-            answer = _answer(log)
-            if exit_code not in (0, 1) or not answer:
-                raise SystemExit(f"{run} of {images} images ended with exit code {exit_code}: see {log}")
-            yield {
-                "images": images, "run": run, "seconds": seconds, "peak_mb": peak, "exit_code": exit_code,
-                "processor_seconds": children_seconds() - used_s,
-                "pairs": answer["stages"]["pairs"]["items"],
-                "stages": {stage: answer["stages"][stage]["seconds"] for stage in STAGES},
-                "report_mb": (work / "report" / "index.html").stat().st_size / 1e6,
-                "workspace_mb": sum(path.stat().st_size for path in work.rglob("*") if path.is_file()) / 1e6,
-            }  # fmt: skip
-        if not args.keep:
-            shutil.rmtree(work, ignore_errors=True)
+        for repeat in range(repeats):
+            before = [row for row in known if (row["images"], row["repeat"]) == (images, repeat)]
+            yield from before if len(before) == 2 else _run_twice(args, folder, images, repeat)
+
+
+def _run_twice(args: Any, folder: Path, images: int, repeat: int) -> Iterator[Row]:
+    """The row of a whole run, and of the same command on its workspace."""
+    work = args.out / f"work-{images}"
+    shutil.rmtree(work, ignore_errors=True)
+    command = [sys.executable, "-m", "aeromatch_cli.cli", "run", args.preset, "--quiet", "--json"]
+    command += ["--images", str(folder / "images"), "--poses", str(folder / "poses.csv")]
+    command += ["--cameras", str(folder / "cameras.json"), "--ground", "0", "--crs", "local"]
+    command += ["--workspace", str(work), "--jobs", str(args.jobs), "--set", f"extract.keypoints={args.keypoints}"]
+    for run in ("run", "again"):
+        log, used_s = args.out / f"{run}-{images}.log", children_seconds()
+        exit_code, seconds, peak_mb = run_watched(command, log)
+        answer = _answer(log)
+        if exit_code not in (0, 1) or not answer:
+            raise SystemExit(f"{run} of {images} images ended with exit code {exit_code}: see {log}")
+        yield {
+            "images": images, "repeat": repeat, "run": run, "seconds": seconds, "peak_mb": peak_mb,
+            "processor_seconds": children_seconds() - used_s,
+            "pairs": answer["stages"]["pairs"]["items"],
+            "stages": {stage: answer["stages"][stage]["seconds"] for stage in STAGES},
+            "report_mb": (work / "report" / "index.html").stat().st_size / 1e6,
+            "workspace_mb": sum(path.stat().st_size for path in work.rglob("*") if path.is_file()) / 1e6,
+        }  # fmt: skip
+    shutil.rmtree(work, ignore_errors=True)
 
 
 def _answer(log: Path) -> dict[str, Any]:
@@ -91,77 +109,58 @@ def _answer(log: Path) -> dict[str, Any]:
     return dict(json.loads(lines[-1])) if lines else {}
 
 
+# What the lines below those of the stages show: title, field, and whose (the whole run's or that of the same again).
+_LINES = (
+    ("whole run, s", "seconds", "run"), ("processor, s", "processor_seconds", "run"), ("again, s", "seconds", "again"),
+    ("peak memory, MB", "peak_mb", "run"), ("of again, MB", "peak_mb", "again"),
+    ("report's page, MB", "report_mb", "run"), ("workspace, MB", "workspace_mb", "run"),
+)  # fmt: skip
+
+
 def table_of(rows: Sequence[Row]) -> str:
-    """Seconds of every stage of the first runs, with exponents, then whole runs, again, memory and sizes."""
-    first = [row for row in rows if row["run"] == "run"]
-    again = {row["images"]: row for row in rows if row["run"] == "again"}
-    heads = ("", *(f"{number(row['images'])} images" for row in first))
-    lines: list[tuple[str, ...]] = [("pairs", *(number(row["pairs"]) for row in first))]
-    lines += [(f"{stage}, s", *_grown(first, lambda row, s=stage: row["stages"][s])) for stage in STAGES]
-    lines.append(("whole run, s", *_grown(first, lambda row: row["seconds"])))
-    lines.append(("processor, s", *_grown(first, lambda row: row["processor_seconds"])))
-    lines.append(("again, s", *_grown(first, lambda row: again[row["images"]]["seconds"])))
-    lines.append(("peak memory, MB", *_grown(first, lambda row: row["peak_mb"])))
-    lines.append(("of again, MB", *_grown(first, lambda row: again[row["images"]]["peak_mb"])))
-    lines.append(("report's page, MB", *(f"{row['report_mb']:.1f}" for row in first)))
-    lines.append(("workspace, MB", *_grown(first, lambda row: row["workspace_mb"])))
+    """Medians over the repeats with their intervals, and exponents from one size to the next."""
+    sizes = list(dict.fromkeys(row["images"] for row in rows))
+    heads = ["", *(f"{number(images)} images" for images in sizes)]
+    heads += [f"exponent to {number(images)}" for images in sizes[1:]]
+    runs = [row for row in rows if row["run"] == "run"]
+    repeats = [sum(row["images"] == images for row in runs) for images in sizes]
+    pairs = [next(number(row["pairs"]) for row in runs if row["images"] == images) for images in sizes]
+    blank = [""] * (len(sizes) - 1)
+    lines = [["runs", *map(str, repeats), *blank], ["pairs", *pairs, *blank]]
+    for stage in STAGES:
+        figures = [{"images": row["images"], "value": row["stages"][stage]} for row in runs]
+        lines.append([f"{stage}, s", *_cells(figures, sizes)])
+    for title, field, run in _LINES:
+        figures = [{"images": row["images"], "value": row[field]} for row in rows if row["run"] == run]
+        lines.append([title, *_cells(figures, sizes)])
     return markdown(heads, lines)
 
 
-def _grown(rows: Sequence[Mapping[str, Any]], value: Any) -> Iterator[str]:
-    """Values, and in brackets by which power of the number of images they have grown."""
-    before: tuple[float, float] | None = None
-    for row in rows:
-        now = float(value(row))
-        text = f"{now:.1f}" if now < 100 else number(now)
-        if before is not None and before[1] > 0.0 and now > 0.0:
-            text += f" ({math.log(now / before[1]) / math.log(row['images'] / before[0]):.2f})"
-        before = row["images"], now
-        yield text
-
-
-def draw_growth(path: Path, rows: Sequence[Row]) -> None:
-    """Write an SVG: seconds of every stage, of the whole run and of the same command again, and n log n beside them."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    matplotlib.rcParams["svg.hashsalt"] = "growth"
-    import matplotlib.pyplot as plt
-
-    first, again = ([row for row in rows if row["run"] == run] for run in ("run", "again"))
-    counts = [row["images"] for row in first]
-    lines = {stage: [row["stages"][stage] for row in first] for stage in STAGES}
-    lines["whole run"] = [row["seconds"] for row in first]
-    lines["again"] = [row["seconds"] for row in again]
-    figure, axis = plt.subplots(figsize=_SIZE_IN)
-    for order, (name, seconds) in enumerate(lines.items()):
-        whole = name not in STAGES
-        style: dict[str, Any] = {"color": "black", "linestyle": "--" if name == "again" else "-"} if whole else {}
-        axis.plot(counts, seconds, marker="os^vD"[order % 5], markersize=4, linewidth=1.2, label=name, **style)
-    top = lines["whole run"][-1] / (counts[-1] * math.log(counts[-1]))
-    axis.plot(counts, [top * n * math.log(n) for n in counts], color="#999999", linestyle=":", label="n log n")
-    axis.set_xscale("log")
-    axis.set_yscale("log")
-    axis.set_xlabel("images")
-    axis.set_ylabel("seconds")
-    axis.grid(color="#eeeeee")
-    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+def _cells(figures: Sequence[Row], sizes: Sequence[int]) -> list[str]:
+    """Of each size the median, with its interval; then by which power of the number of images it has grown."""
+    own = {images: values([row for row in figures if row["images"] == images], "value") for images in sizes}
+    middle = {images: float(np.median(found)) for images, found in own.items()}
+    cells = [ranged(middle[n], interval(own[n], medians), 1 if middle[n] < 100 else 0) for n in sizes]
+    for before, after in pairwise(sizes):
+        grown = middle[before] > 0.0 and middle[after] > 0.0
+        power = math.log(middle[after] / middle[before]) / math.log(after / before) if grown else math.nan
+        cells.append(number(power, 2))
+    return cells
 
 
 def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("growth", __doc__)
     add = parser.add_argument
-    add("--images", type=options.numbers, default="100,1000,10000", help="of each block, comma-separated, ascending")
+    add("--images", type=options.numbers, default="100,300,1000", help="of each block, comma-separated, ascending")
+    add("--repeats", type=options.numbers, default="3,2,1", help="runs of each block, comma-separated")
     add("--preset", default="baseline")
     add("--keypoints", type=options.positive, default=200)
-    add("--keep", action="store_true", help="leave the workspaces in OUT")
     add("--seed", type=int, default=0)
     add("--jobs", type=options.positive, default=2)
     options.add_output(parser)
-    args = options.parse(parser, arguments, {"images": "20,40"})
+    args = options.parse(parser, arguments, {"images": "20,40", "repeats": "2,1"})
+    if len(args.images) != len(args.repeats):
+        parser.error("--repeats must say for every block of --images how often it is run")
     args.out.mkdir(parents=True, exist_ok=True)
     kept = args.out / "growth.json"
     rows: list[Row] = []
@@ -169,11 +168,7 @@ def main(arguments: Sequence[str]) -> None:
         rows.append(row)
         write_rows(kept, rows)
         print({key: value for key, value in row.items() if key != "stages"}, row["stages"], file=sys.stderr)
-    draw_growth(args.out / "growth.svg", rows)
-    if args.docs is not None:
-        draw_growth(FOLDER / "large.svg", rows)
     options.publish(
-        args, table_of(rows) + "\n", args.out / "growth.md", table="bench_growth_blocks",
-        command=options.command_line(parser, args),
-        versions=stamps.of_chain(args.preset, [f"extract.keypoints={args.keypoints}"]),
+        args, table_of(rows) + "\n", args.out / "growth.md", table="bench_growth",
+        command=options.command_line(parser, args), versions=stamps.of_pipeline(),
     )  # fmt: skip

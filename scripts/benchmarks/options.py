@@ -11,7 +11,7 @@ from typing import Any
 from aeromatch_cli.files import write_text
 from aeromatch_cli.lab.synthetic import PRESETS
 from aeromatch_cli.lab.synthetic.flight_plans import FLIGHTS
-from benchmarks.pages import FOLDER, PAGES, write_table
+from benchmarks.pages import write_table
 from benchmarks.stamps import Version, make_stamp
 
 
@@ -67,15 +67,19 @@ def add_rendered(
     add("--images", type=positive, default=images, help="of each rendered block")
 
 
-def add_output(parser: argparse.ArgumentParser, tables: int = 1) -> None:
-    """Where results and tables go. tables: several have names of their own."""
-    about = "write into docs/results"
-    if tables == 1:
-        about += "; TABLE: another table than the benchmark's own"
-        parser.add_argument("--docs", choices=("", *PAGES), nargs="?", const="", metavar="TABLE", help=about)
-    else:
-        parser.add_argument("--docs", action="store_const", const="", help=about)
+def add_output(parser: argparse.ArgumentParser) -> None:
+    """Where results and tables go."""
+    parser.add_argument("--docs", action="store_true", help="write into docs/results")
     parser.add_argument("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
+
+
+def section_of(
+    name: str, about: str | None, sections: Sequence[str], arguments: Sequence[str]
+) -> tuple[str, list[str]]:
+    """The first of the arguments, one of the sections of a benchmark, and the others."""
+    parser = make_parser(name, about)
+    parser.add_argument("section", choices=sections)
+    return parser.parse_args(arguments[:1]).section, list(arguments[1:])
 
 
 def flight_names(text: str) -> list[str]:
@@ -124,10 +128,9 @@ def publish(
 ) -> None:
     """Write a text and print it; with --docs a page of docs/results has it, or `page_text`, too.
 
-    table: that it fills where --docs names none. versions: what it depends on, of `benchmarks.stamps`.
+    table: that it fills. versions: what it depends on, of `benchmarks.stamps`.
     """
     write_text(path, text)
     print(text)
-    if args.docs is not None:
-        name = args.docs or table
-        write_table(FOLDER / PAGES[name], name, page_text or text, make_stamp(command, versions))
+    if args.docs:
+        write_table(table, page_text or text, make_stamp(command, versions))

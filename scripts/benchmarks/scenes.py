@@ -92,7 +92,12 @@ def rendered_scenes(args: argparse.Namespace, condition: str) -> Iterator[tuple[
     selection = Selection(condition, args.pairs, args.seed)
     for flight, preset in product(args.flights, args.scenes):
         out = render_asked(args, preset, flight=flight)
-        yield flight, _judged(preset, out, open_truth(out), selection, set())
+        yield flight, judged_block(preset, out, selection)
+
+
+def judged_block(name: str, folder: Path, selection: Selection) -> Judged:
+    """A rendered block that lies there already."""
+    return _judged(name, folder, open_truth(folder), selection, set())
 
 
 def real(folder: Path, data: Path, block: str, selection: Selection, *, max_size_px: int) -> Judged:

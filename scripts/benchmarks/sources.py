@@ -9,7 +9,10 @@ import aeromatch_cli
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 
 # Source that answers depend on, below the package or scripts. Peers read no more of the package than lens models.
-PEER_CODE = ("geometry/cameras.py", "geometry/frames.py", "benchmarks/peers", "benchmarks/processes.py")
+PEER_CODE = (
+    "geometry/cameras.py", "geometry/frames.py", "benchmarks/processes.py",
+    *(f"benchmarks/peers/{name}.py" for name in ("base", "colmap", "kornia_peers", "matching", "opencv", "superpoint")),
+)  # fmt: skip
 OUR_CODE = (
     "blocks", "geometry", "nets", "sfm", "stages", "strategies", "data.py", "formats", "images",
     "lab/strategies", "benchmarks/peers/ours.py",

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.config import FAMILIES, Settings, load
+from aeromatch_cli.config import FAMILIES, Settings, load, parse_method
 from aeromatch_cli.lab.strategies import ARMS
 from aeromatch_cli.nets.files import SHIPPED_FOLDER, sha256_of_file
 from aeromatch_cli.nets.precision import has_bfloat16
@@ -21,7 +21,7 @@ from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
 
 Version = int | str
 Versions = Mapping[str, Version]
-# command, commit, date, machine, trained_on, versions; null where unknown.
+# command, commit (null outside a repository), date, machine, trained_on, versions.
 Stamp = dict[str, Any]
 REPOSITORY = Path(__file__).parent.parent.parent
 _ORIENTATION: Versions = {
@@ -53,11 +53,9 @@ def make_stamp(command: str, versions: Versions) -> Stamp:
 
 def said(stamp: Stamp) -> str:
     """The line of a page that says what a stamp holds."""
-    blocks = stamp["trained_on"]
-    known = "unknown blocks" if blocks is None else ", ".join(blocks)
-    trained = f"; networks trained on {known}" if known else ""
-    facts = stamp["commit"] or "unknown", stamp["date"] or "date unknown", stamp["machine"] or "machine unknown"
-    return "Commit {}, {}; {}".format(*facts) + f"{trained}."
+    blocks = ", ".join(stamp["trained_on"])
+    trained = f"; networks trained on {blocks}" if blocks else ""
+    return f"Commit {stamp['commit'] or 'unknown'}, {stamp['date']}; {stamp['machine']}{trained}."
 
 
 def commit() -> str | None:
@@ -110,14 +108,22 @@ def of_settings(*every: Settings, families: Collection[str] = tuple(FAMILIES)) -
     return found
 
 
-def of_chain(preset: str, overrides: Sequence[str] = ()) -> dict[str, Version]:
-    """Versions of all that `aeromatch run` rests on with a preset."""
-    return of_whole_runs(load(preset, overrides))
+def of_pipeline() -> dict[str, Version]:
+    """Of tables that state seconds and memory, which no strategy's results change."""
+    return {"pipeline": PIPELINE_VERSION}
 
 
-def of_whole_runs(*every: Settings) -> dict[str, Version]:
-    """The same of several settings."""
-    return of_settings(*every) | (_ORIENTATION if every else {})
+def of_matching(*every: Settings) -> dict[str, Version]:
+    """Versions of all that the matches of some settings rest on, in a block that is oriented already."""
+    return of_settings(*every, families=[family for family in FAMILIES if family != "export"])
+
+
+def of_chain(*methods: str, exported: bool = False) -> dict[str, Version]:
+    """Versions of all that `aeromatch run` rests on with presets, PRESET or PRESET[key=value,...]. exported: whether
+    the table shows what others make of the export."""
+    every = [load(*parse_method(method)) for method in methods]
+    found = of_matching(*every) | (_ORIENTATION if every else {})
+    return found | (of_settings(*every, families=("export",)) if exported else {})
 
 
 def of_strategies(family: str, *strategies: Strategy) -> dict[str, Version]:
@@ -144,8 +150,5 @@ def present_versions() -> dict[str, Version]:
 
 
 def changed(stamp: Stamp, present: Versions) -> Iterator[str]:
-    """What a table depends on that is not what it was; an unknown version counts as changed."""
-    if stamp["versions"] is None:
-        yield "versions"
-        return
-    yield from (key for key, value in stamp["versions"].items() if value is None or present.get(key) != value)
+    """What a table depends on that is not what it was."""
+    yield from (key for key, value in stamp["versions"].items() if present.get(key) != value)

@@ -10,12 +10,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.files import write_text
 
 Row = dict[str, Any]
 T = TypeVar("T")
 # Title of a column, and how its cell is made of what a line is about.
 Column = tuple[str, Callable[[T], object]]
+# Maps samples (draws, N, ...) to the statistic of each (draws,).
+Statistic = Callable[[FloatArray], FloatArray]
+_DRAWS, _LEVEL = 1000, 0.90
 
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:
@@ -65,11 +69,6 @@ def total(rows: Iterable[Row], field: str) -> float:
     return math.fsum(values(rows, field))
 
 
-def mean(rows: Iterable[Row], field: str) -> float:
-    """Over the rows that have a figure, NaN without any."""
-    return float(np.mean(found)) if (found := values(rows, field)) else math.nan
-
-
 def median(rows: Iterable[Row], field: str) -> float:
     """Over the rows that have a figure, NaN without any."""
     return float(np.median(found)) if (found := values(rows, field)) else math.nan
@@ -80,6 +79,46 @@ def ratio(part: float, whole: float) -> float:
     if whole == 0:
         return math.nan if part == 0 else math.inf
     return part / whole
+
+
+def interval(units: Sequence[Any] | FloatArray, statistic: Statistic) -> tuple[float, float]:
+    """The 90 % interval of a statistic by bootstrap: `units` (N, ...), of pairs or blocks, are drawn N at a time with
+    replacement, 1,000 times, with a fixed seed. NaN where there are fewer than two."""
+    values = np.asarray(units, np.float64)
+    if len(values) < 2:
+        return math.nan, math.nan
+    drawn = np.random.default_rng(0).integers(len(values), size=(_DRAWS, len(values)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = statistic(values[drawn])
+    found = found[~np.isnan(found)]
+    if not len(found):
+        return math.nan, math.nan
+    low, high = np.quantile(found, [0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2], method="nearest")
+    return float(low), float(high)
+
+
+def ratio_of_sums(samples: FloatArray) -> FloatArray:
+    """For `interval`: of units (N, 2), the sum of the first over that of the second."""
+    parts: FloatArray = samples.sum(axis=1)
+    return np.asarray(parts[:, 0] / parts[:, 1])
+
+
+def means(samples: FloatArray) -> FloatArray:
+    """For `interval`."""
+    return np.asarray(samples.mean(axis=1))
+
+
+def medians(samples: FloatArray) -> FloatArray:
+    """For `interval`."""
+    return np.asarray(np.median(samples, axis=1))
+
+
+def ranged(value: float, bounds: tuple[float, float], digits: int, unit: str = "") -> str:
+    """A figure with its interval: "1.79 (1.60 to 1.95)"."""
+    if not math.isfinite(value):
+        return "-"
+    text = f"{value:.{digits}f}{unit}"
+    return text if math.isnan(bounds[0]) else f"{text} ({bounds[0]:.{digits}f} to {bounds[1]:.{digits}f})"
 
 
 def code(name: object) -> str:

@@ -34,9 +34,13 @@ def whole_run(
     extra: Sequence[str] = (),
     jobs: int = 2,
     settings: Sequence[str] = (),
+    start: Path | None = None,
 ) -> Run:
-    """`aeromatch COMMAND PRESET` into an empty workspace. extra: further options; settings: as in `--set`."""
+    """`aeromatch COMMAND PRESET` into an empty workspace, or into a copy of `start`, of which it goes on. extra:
+    further options; settings: as in `--set`."""
     shutil.rmtree(work, ignore_errors=True)
+    if start is not None:
+        shutil.copytree(start, work)
     words = [sys.executable, "-m", "aeromatch_cli.cli", command, preset, "--images", str(images), *extra]
     words += ["--workspace", str(work), "--jobs", str(jobs), "--quiet", "--json"]
     words += [f"--set={setting}" for setting in settings]
@@ -46,6 +50,15 @@ def whole_run(
     finished = done.returncode in (0, 1) and bool(done.stdout.strip())
     answer = json.loads(done.stdout.splitlines()[-1]) if finished else {}
     return Run(done.returncode, seconds, answer, done.stderr.strip())
+
+
+def chosen_images(source: Path, every: int, folder: Path) -> Path:
+    """Folder of links to every k-th image by name."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for path in sorted(source.iterdir())[::every]:
+        (folder / path.name).symlink_to(path.resolve())
+    return folder
 
 
 def budget_settings(settings: Settings, keypoints: int) -> list[str]:

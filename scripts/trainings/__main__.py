@@ -1,4 +1,4 @@
-"""`scripts/train NAME [OPTION ...]`: runs one training; without a name it lists them."""
+"""`scripts/train NAME [OPTION ...]`: makes again what ships and was fitted; without a name it lists all."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ TABLE: Table = {
     "orientation": ("trainings.orientation.command", "orientation network of extract=learned"),
     "descriptor": ("trainings.descriptor.command", "GeoDesc descriptors of extract=learned"),
     "context": ("trainings.context.command", "context network of extract=learned"),
+    "evidence": ("trainings.evidence", "weights that say how many matches a step of auto may bring"),
+    "probability": ("trainings.probability", "weights of the probability that a match is right"),
 }
 
 

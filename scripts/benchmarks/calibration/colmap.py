@@ -2,7 +2,6 @@
 
 colmap           incremental mapping: SIMPLE_RADIAL, the principal point in the middle
 colmap-opencv    its model adjusted once more as OPENCV, principal point free
-colmap-priors    that adjusted once more, with the given positions as observations
 
 Run as a module: FOLDER and PEER. The folder holds what the exporter for COLMAP has written, and stated.npy: given
 positions (image number, x, y, z, sigma), which place the model in the world; found.npz is written into it.
@@ -28,8 +27,7 @@ from aeromatch_cli.strategies.exporters.colmap import Colmap
 from benchmarks.calibration.accuracy import Found
 from benchmarks.calibration.simulate import SimulatedBlock
 
-WITH_POSITIONS = "colmap-priors"
-PEERS = ("colmap", "colmap-opencv", WITH_POSITIONS)
+PEERS = ("colmap", "colmap-opencv")
 _SCRIPTS = Path(__file__).parent.parent.parent
 _FEWEST_POSITIONS = 3
 
@@ -83,8 +81,6 @@ def _solve(folder: Path, peer: str) -> None:
     if peer != "colmap":
         _adjust(pycolmap, model)
         _place(pycolmap, model, stated)
-    if peer == WITH_POSITIONS and len(stated) >= _FEWEST_POSITIONS:  # exact ones tear a model that is still bent
-        _adjust_with(pycolmap, model, stated)
     lens = next(iter(model.cameras.values())).model.name
     numbers, cameras = image_numbers(model), sorted(model.cameras)
     np.savez(
@@ -105,39 +101,17 @@ def _place(pycolmap: ModuleType, model: Any, stated: FloatArray) -> None:
         model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), shift))
 
 
-def _options(pycolmap: ModuleType) -> Any:
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_principal_point = True
-    options.ceres.solver_options.num_threads = 1
-    return options
-
-
 def _adjust(pycolmap: ModuleType, model: Any) -> None:
     """As OPENCV with a free principal point."""
     for camera in model.cameras.values():
         focal, x, y, k1 = camera.params
         camera.model = pycolmap.CameraModelId.OPENCV
         camera.params = [focal, focal, x, y, k1, 0.0, 0.0, 0.0]
-    pycolmap.bundle_adjustment(model, _options(pycolmap))
-
-
-def _adjust_with(pycolmap: ModuleType, model: Any, stated: FloatArray) -> None:
-    """With positions (image number, x, y, z, sigma) as observations."""
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in image_numbers(model):
-        config.add_image(number)
-    priors = [
-        pycolmap.PosePrior(
-            corr_data_id=model.images[int(row[0])].data_id,
-            position=row[1:4],
-            position_covariance=np.eye(3) * row[4] ** 2,
-            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
-        )
-        for row in stated
-    ]
-    prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
-    pycolmap.create_pose_prior_ceres_bundle_adjuster(_options(pycolmap), prior_options, config, priors, model).solve()
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point = True
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.bundle_adjustment(model, options)
 
 
 if __name__ == "__main__":

@@ -8,24 +8,22 @@ gps5m: positions with a common drift of 5 m and 1 m noise; rtk2cm: 2 cm, heights
 degree, the mounting 0.5). nothing: none. Errors are those of about 60 check points intersected from 0.3 px measurements
 with the result, in ground pixels, after the best similarity to truth: medians of a block horizontally and in height,
 and within how many 95 % of the heights are (a bent block has large ones). Absolute: without similarity, where positions
-are exact. Of each line: the median over the scenes and seeds, in brackets the worst case. Focal length and principal
-point: errors of the median camera. Error / stated: of projection centres, over their stated standard deviations.
-Verdicts: how many blocks were called good, doubtful and bad.
+are exact. Of each line: the median over its blocks, in brackets its 90 % interval by bootstrap over them. Focal length
+and principal point: errors of the median camera. Error / stated: of projection centres, over their stated standard
+deviations. Verdicts: how many blocks were called good, doubtful and bad.
 
 Peers: colmap: incremental mapping, SIMPLE_RADIAL, principal point in the middle; colmap-opencv: its model adjusted once
-more as OPENCV with a free principal point; colmap-priors: and so with the given positions as observations. Models are
-put into the world by the positions.
+more as OPENCV with a free principal point. Models are put into the world by the positions.
 
-Start mapped: what `map_block` finds; perturbed: exact poses made worse by 0.5 degrees and 1 % of the flying height,
-neighbours nearly alike.
 Writes OUT/rows/CASE.json for every case, OUT/results.json and OUT/calibration.md; rows that OUT has are not made again.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,24 +38,35 @@ from aeromatch_cli.sfm.quality.judgement import judged as verdict
 from aeromatch_cli.stages import adjust, orient
 from benchmarks import options, stamps
 from benchmarks.calibration.accuracy import Found, judged
-from benchmarks.calibration.colmap import PEERS, WITH_POSITIONS, mapped_by_colmap
-from benchmarks.calibration.simulate import FLIGHTS, POSITIONS, mapped, perturbed, simulate
+from benchmarks.calibration.colmap import PEERS, mapped_by_colmap
+from benchmarks.calibration.simulate import FLIGHTS, POSITIONS, mapped, simulate
 from benchmarks.calibration.verdict import of_adjusted
 from benchmarks.processes import fresh_process, limit_threads
-from benchmarks.tables import Column, Row, code, grouped, number, table, values, write_rows
+from benchmarks.tables import (
+    Column,
+    Row,
+    code,
+    grouped,
+    interval,
+    medians,
+    number,
+    ranged,
+    table,
+    values,
+    write_rows,
+)
 
 _OURS = "aeromatch"
 
 
 class Case(NamedTuple):
-    """One simulated block. start: how poses are known before the adjustment."""
+    """One simulated block."""
 
     scene: str
     flight: str
     images: int
     positions: str
     seed: int
-    start: str
     tie_points: int
 
 
@@ -76,7 +85,7 @@ def _run(case: Case, method: str, path: Path) -> None:
     began = time.perf_counter()
     try:
         if method == _OURS:
-            contents, groups = perturbed(block) if case.start == "perturbed" else mapped(block)
+            contents, groups = mapped(block)
             adjusted, facts = adjust_block(contents, block.observed, groups, fixed=False)
             found: Found | None = Found.of(adjusted)
             evidence = of_adjusted(contents, block.observed, adjusted, facts, metric=case.positions != "nothing")
@@ -105,16 +114,10 @@ def rows_of(args: Any) -> Iterator[Row]:
     """All rows, the missing ones made first: cases of one scene and seed in one process, which builds it once."""
     axes = product(args.scenes, args.seeds, args.flights, args.images, args.positions)
     cases = [
-        Case(scene, flight, images, positions, seed, args.start, args.points)
-        for scene, seed, flight, images, positions in axes
+        Case(scene, flight, images, positions, seed, args.points) for scene, seed, flight, images, positions in axes
     ]
     methods = [_OURS, *args.peers]
-    every = [
-        (case, method, _path(args.out, case, method))
-        for case in cases
-        for method in methods
-        if not (case.positions == "nothing" and method == WITH_POSITIONS)
-    ]
+    every = [(case, method, _path(args.out, case, method)) for case in cases for method in methods]
     batches: dict[tuple[str, int], list[tuple[Case, str, Path]]] = {}
     for item in every:
         if not item[2].is_file():
@@ -126,28 +129,35 @@ def rows_of(args: Any) -> Iterator[Row]:
         yield {key: value for key, value in read_json(path).items() if key != "sha256"}
 
 
-def _cell(field: str, digits: int) -> Column[Sequence[Row]]:
+def _cell(field: str, digits: int) -> Callable[[Sequence[Row]], str]:
     def cell(rows: Sequence[Row]) -> str:
         found = values(rows, field)
-        if not found:
-            return "-"
-        return f"{number(float(np.median(found)), digits)} ({number(max(found), digits)})"
+        return ranged(float(np.median(found)), interval(found, medians), digits) if found else "-"
 
-    return "", cell
+    return cell
 
 
-def _columns() -> list[Column[Sequence[Row]]]:
-    cells = (
-        ("horizontal, px", "horizontal_px", 2), ("height, px", "height_px", 2), ("95 % of heights, px", "bend_px", 2),
-        ("absolute, horizontal", "absolute_horizontal_px", 2), ("absolute, height", "absolute_height_px", 2),
-        ("focal length, %", "focal_percent", 3), ("principal point, px", "centre_px", 1),
-        ("error / stated", "stated_ratio", 2), ("s", "seconds", 1),
-    )  # fmt: skip
-    return [
-        ("images oriented", _oriented),
-        ("verdicts", _verdicts),
-        *((title, _cell(field, digits)[1]) for title, field, digits in cells),
-    ]
+def _worst(rows: Sequence[Row]) -> str:
+    """Largest errors of a block, horizontally and in height."""
+    found = [max(values(rows, field), default=math.nan) for field in ("horizontal_px", "height_px")]
+    return " / ".join(number(value, 2) for value in found)
+
+
+_COLUMNS: Sequence[Column[Sequence[Row]]] = (
+    ("blocks", len),
+    ("images oriented", lambda rows: _oriented(rows)),
+    ("verdicts", lambda rows: _verdicts(rows)),
+    ("horizontal, px", _cell("horizontal_px", 2)),
+    ("height, px", _cell("height_px", 2)),
+    ("95 % of heights, px", _cell("bend_px", 2)),
+    ("worst block", _worst),
+    ("absolute, horizontal", _cell("absolute_horizontal_px", 2)),
+    ("absolute, height", _cell("absolute_height_px", 2)),
+    ("focal length, %", _cell("focal_percent", 3)),
+    ("principal point, px", _cell("centre_px", 1)),
+    ("error / stated", _cell("stated_ratio", 2)),
+    ("s", _cell("seconds", 1)),
+)
 
 
 def _oriented(rows: Sequence[Row]) -> str:
@@ -161,22 +171,23 @@ def _verdicts(rows: Sequence[Row]) -> str:
 
 
 def table_of(rows: Sequence[Row]) -> str:
+    """A line for every flight, number of images, positions and method, and one for all of each method."""
     keys = ("flight", "images", "positions", "method")
-    groups = ((("" if not labels else [*labels[:3], code(labels[3])]), own) for labels, own in grouped(rows, *keys))
-    return table(keys, groups, _columns())
+    groups = [([*labels[:3], code(labels[3])], own) for labels, own in grouped(rows, *keys)]
+    groups += [(["all", "", "", code(method)], own) for (method,), own in grouped(rows, "method")]
+    return table(keys, groups, _COLUMNS)
 
 
 def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("calibration", __doc__)
     add = parser.add_argument
-    add("--scenes", type=options.names, default="city,suburb,farmland,hills", help="presets of rendered blocks")
+    add("--scenes", type=options.names, default="suburb,hills", help="presets of rendered blocks")
     add("--flights", type=options.names, default="nadir,cross,mixed,five", help=f"of {', '.join(FLIGHTS)}")
-    add("--images", type=options.numbers, default="12,24,48")
+    add("--images", type=options.numbers, default="24")
     add("--positions", type=options.names, default=",".join(POSITIONS))
     add("--seeds", type=options.numbers, default="1-3")
-    add("--points", type=options.positive, default=800, help="about so many tie points in an image")
-    add("--start", choices=("mapped", "perturbed"), default="mapped")
-    add("--peers", type=options.names, default="", help=f"of {', '.join(PEERS)}")
+    add("--points", type=options.positive, default=500, help="about so many tie points in an image")
+    add("--peers", type=options.names, default="colmap-opencv", help=f"of {', '.join(PEERS)}")
     add("--jobs", type=options.positive, default=2)
     options.add_output(parser)
     quick = {"scenes": "farmland", "flights": "cross", "images": "12", "seeds": "1", "points": 300}
@@ -188,14 +199,8 @@ def main(arguments: Sequence[str]) -> None:
     (args.out / "rows").mkdir(parents=True, exist_ok=True)
     rows = list(rows_of(args))
     write_rows(args.out / "results.json", rows)
-    versions: dict[str, stamps.Version] = {"stage.adjust": adjust.VERSION}
-    if args.start == "mapped":
-        versions["stage.orient"] = orient.VERSION
+    versions: dict[str, stamps.Version] = {"stage.adjust": adjust.VERSION, "stage.orient": orient.VERSION}
     options.publish(
         args, table_of(rows) + "\n", args.out / "calibration.md", table="bench_calibration",
         command=options.command_line(parser, args), versions=versions,
     )  # fmt: skip
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -5,4 +5,6 @@ matching  nearest neighbours and MAGSAC++, as users of OpenCV and kornia call th
 opencv, colmap, kornia_peers, superpoint   the peers; ground: any of them on rectified views
 ours      a preset of this project
 table     name -> method
+worker    one method on one scene in a process of its own; its answers on disk
+command   `bench peers`
 """

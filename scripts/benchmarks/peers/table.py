@@ -43,8 +43,6 @@ PEERS: Mapping[str, Make] = {
 }
 _NETWORKS = ("aliked", "keynet", "keynet-tfeat", "superpoint")
 NEED_WEIGHTS = tuple(name for name in PEERS if name.removesuffix(ON_GROUND) in _NETWORKS)
-# What --methods stands for where it is not given: whatever needs no weights, on the pictures as they are.
-CLASSICAL = tuple(name for name in PEERS if name not in NEED_WEIGHTS and not name.endswith(ON_GROUND))
 
 
 def reads_poses(spec: str) -> bool:

@@ -1,0 +1,129 @@
+"""Whether `auto`, one command without a preset's name, gives at least what the best preset gives. Sections:
+
+  rendered    presets and peers on rendered blocks with exact truth, by condition: one sun, two suns, two exposures
+              (every second picture got an eighth of the light, with noise, in 8 bits), five cameras, texture-poor
+              ground, rows and facades. Presets get the block's cameras and noisy poses (5 % of the flying height, 3
+              degrees); peers every pair of the block that overlaps by 20 % or more. These pairs count, whether a preset
+              tries them or not, and no others. `polar` is asked where all pictures look straight down
+  strategies  `auto` with other settings (--strategies, each KEY=VALUE or auto[KEY=VALUE,...]) on the same blocks,
+              beside `auto`: "in auto" where it brings 2 % more right matches at no lower share of right ones (to 0.1
+              percent points), or a fifth fewer wrong ones for at most 1 % fewer right ones
+  real        every k-th image of real blocks (DATA/BLOCK/images, DATA/BLOCK/reference/{poses.csv,block.json}), with
+              positions that are off by 5 m or nothing, cameras from EXIF: images in the largest group of the adjusted
+              block, beside what both of pycolmap's mappers (incremental / global) register from the same run's export
+              and from pycolmap's own chain: its SIFT of the same size and number, exhaustive guided matching. Right:
+              attitudes within 3 degrees of the reference after one common turn. Points, error, seconds of pycolmap: of
+              the mapper that registers more; seconds are those of the whole chain
+
+Correct: within 3 px of the exact place in both directions. Right: the share of the kept matches that is correct, in the
+block where it is least, too. Auto / it: correct matches on the same pairs. Seconds: of whole runs without report on one
+core, of peers of features, matching and verification. Methods with SIFT have --keypoints descriptors an image, those
+with networks half as many; a cascade has both. In brackets: 90 % intervals by bootstrap, over pairs in rendered blocks,
+over cases in real ones. What OUT has of the same code and options is not made again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from aeromatch_cli.config import parse_method
+from benchmarks import options, stamps
+from benchmarks.auto import real, rendered, strategies
+from benchmarks.auto.blocks import PLACES
+from benchmarks.auto.runs import JUDGED
+from benchmarks.peers.table import PEERS, check_method, split_methods
+from benchmarks.processes import limit_threads
+from benchmarks.tables import Row, write_rows
+
+METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
+STRATEGIES = (
+    "filter=epipolar+graph,filter=clustered-ransac+epipolar,"
+    "consistency.min_probability=0.5,simulate=neighbours,cascade=guided"
+)
+
+
+def _rendered(section: str, arguments: Sequence[str]) -> None:
+    parser = options.make_parser(f"auto {section}", __doc__)
+    add = parser.add_argument
+    add("--places", type=options.names, default=",".join(PLACES), metavar="SCENE:FLIGHT", help="comma-separated")
+    add(
+        "--seeds",
+        type=options.numbers,
+        default="1,2" if section == "rendered" else "1",
+        help="of the blocks, comma-separated",
+    )
+    add("--size", metavar="WxH", default="640x480", help="of rendered images")
+    add("--images", type=options.positive, default=6, help="of each rendered block, twice as many of five cameras")
+    about = "SIFT descriptors per image; networks have half as many"
+    add("--keypoints", type=options.positive, default=4096, help=about)
+    if section == "rendered":
+        add("--methods", type=split_methods, default=METHODS, help=f"presets, and of {', '.join(PEERS)}")
+    else:
+        add("--strategies", type=split_methods, default=STRATEGIES, help="settings of auto, comma-separated")
+    add("--jobs", type=options.positive, default=2, help="methods at a time, on one core each")
+    add("--reference-weights", type=Path, metavar="DIR", help="weights of peers that are networks")
+    options.add_output(parser)
+    quick = {"places": "suburb:nadir,suburb:exposed", "seeds": "1", "size": "320x240", "images": 4, "keypoints": 1000}
+    args = options.parse(parser, arguments, quick)
+    if unknown := sorted(set(args.places) - set(PLACES)):
+        parser.error(f"--places: {', '.join(unknown)} are none of {', '.join(PLACES)}")
+    methods = args.methods if section == "rendered" else [JUDGED, *strategies.asked_of(args.strategies)]
+    if JUDGED not in methods:
+        parser.error(f"--methods must hold {JUDGED}, which the others are compared with")
+    for method in methods:
+        check_method(method)
+    limit_threads(1)
+    rows: list[Row] = []
+    for own in rendered.measured(args, methods):
+        rows += own
+        print(f"{own[0]['block']}: {own[0]['method']}" if own else "no pair", file=sys.stderr, flush=True)
+        write_rows(args.out / f"{section}.json", rows)
+    make, table = (
+        (rendered.table_of, "bench_auto") if section == "rendered" else (strategies.table_of, "bench_auto_strategies")
+    )
+    presets = [method for method in methods if parse_method(method)[0] not in PEERS]
+    options.publish(
+        args, make(rows) + "\n", args.out / f"{section}.md", table=table,
+        command=options.command_line(parser, args), versions=stamps.of_chain(*presets),
+    )  # fmt: skip
+
+
+def _real(arguments: Sequence[str]) -> None:
+    parser = options.make_parser("auto real", __doc__)
+    add = parser.add_argument
+    add("--data", type=Path, required=True, metavar="DIR", help="folder of blocks")
+    add("--blocks", type=options.names, default="ochota,lewis,seneca,caliterra", help="names, comma-separated")
+    add("--thin", type=options.numbers, default="3", help="keep every k-th image; several k comma-separated")
+    add("--given", type=options.names, default="positions,nothing", help=f"of {', '.join(real.GIVEN)}")
+    add("--presets", type=split_methods, default=JUDGED, help="comma-separated")
+    add("--keypoints", type=options.positive, default=4000, help="SIFT descriptors per image")
+    add("--max-size", type=options.positive, default=1600, help="longer side of images, px")
+    add("--jobs", type=options.positive, default=2)
+    options.add_output(parser)
+    quick = {"blocks": "seneca", "thin": "5", "presets": "baseline", "keypoints": 1000, "max_size": 800}
+    args = options.parse(parser, arguments, quick)
+    if unknown := sorted(set(args.given) - set(real.GIVEN)):
+        parser.error(f"--given: {', '.join(unknown)} are none of {', '.join(real.GIVEN)}")
+    for method in args.presets:
+        check_method(method, ())
+    limit_threads(2)
+    rows = []
+    for row in real.rows_of(args):
+        rows.append(row)
+        print(json.dumps(row), file=sys.stderr, flush=True)
+        write_rows(args.out / "real.json", rows)
+    options.publish(
+        args, real.table_of(rows) + "\n", args.out / "real.md", table="bench_auto_real",
+        command=options.command_line(parser, args), versions=stamps.of_chain(*args.presets, exported=True),
+    )  # fmt: skip
+
+
+def main(arguments: Sequence[str]) -> None:
+    section, rest = options.section_of("auto", __doc__, ("rendered", "strategies", "real"), arguments)
+    if section == "real":
+        _real(rest)
+    else:
+        _rendered(section, rest)

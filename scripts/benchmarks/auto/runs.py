@@ -1,0 +1,86 @@
+"""One method on one rendered block: rows of its pairs, kept on disk, so that a killed benchmark goes on there."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import re
+import shutil
+from pathlib import Path
+from threading import Lock
+
+from aeromatch_cli.config import load, parse_method
+from aeromatch_cli.files import read_json, write_json
+from benchmarks.auto.blocks import Block
+from benchmarks.peers.base import Options
+from benchmarks.peers.table import NEED_WEIGHTS, PEERS, reads_poses
+from benchmarks.peers.worker import measure
+from benchmarks.scenes import NOISY_POSES, Judged, with_noisy_poses
+from benchmarks.sources import OUR_CODE, code_digest
+from benchmarks.tables import Row, plain
+from benchmarks.whole import budget_settings, evaluated, whole_run
+
+JUDGED = "auto"
+# Several settings of auto, which run at a time, start from one workspace.
+_making = Lock()
+_FIGURES = ("kept", "correct", "median_error_px")
+
+
+def rows_of(args: argparse.Namespace, block: Block, judged: Judged, method: str) -> list[Row]:
+    """A row for each judged pair."""
+    peer = method in PEERS
+    folder = args.out / "runs" / block.slug / re.sub(r"[^a-z0-9.]+", "-", method.lower()).strip("-")
+    path = folder / "rows.json"
+    asked = {"method": method, "block": judged.key, "keypoints": args.keypoints}
+    asked |= {} if peer else {"code": code_digest(*OUR_CODE)}
+    known = read_json(path) if path.is_file() else {}
+    if known.get("asked") != asked:
+        found = _peer_rows(args, judged, method) if peer else _preset_rows(args, block, judged, method, folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        known = {"asked": asked, "rows": found}
+        write_json(path, known)
+    return [{"block": block.name, "conditions": block.conditions, "method": method, **row} for row in known["rows"]]
+
+
+def _preset_rows(args: argparse.Namespace, block: Block, judged: Judged, method: str, folder: Path) -> list[Row]:
+    """By `aeromatch run` with the block's cameras and noisy poses. auto's workspace stays; auto with other settings
+    goes on from a copy of it, so that only what these change is made again."""
+    preset, own = parse_method(method)
+    scene, work = judged.scene, folder / "work"
+    given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
+    settings = [*budget_settings(load(preset, own), args.keypoints), *own, "run.report=false"]
+    start = None
+    if preset == JUDGED and own:
+        with _making:
+            rows_of(args, block, judged, JUDGED)
+        start = folder.with_name(JUDGED) / "work"
+    run = whole_run("run", preset, scene.images, work, extra=given, jobs=1, settings=settings, start=start)
+    if not run.answer:
+        raise SystemExit(f"aeromatch run {method} on {block.name} failed with exit code {run.code}:\n{run.said}")
+    evaluated(work, scene.images.parent, mapping=False)
+    with (work / "evaluation" / "pairs.csv").open(encoding="utf-8", newline="") as stream:
+        by_pair = {(row["image0"], row["image1"]): row for row in csv.DictReader(stream)}
+    if method != JUDGED:
+        shutil.rmtree(work)
+    found = [by_pair[pair.images] for pair in judged.pairs]
+    seconds = run.seconds / max(1, len(found))
+    return [{**{key: plain(float(row[key] or "nan")) for key in _FIGURES}, "seconds": seconds} for row in found]
+
+
+def _peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
+    """Every judged pair in turn; features of an image count once."""
+    most = args.keypoints // 2 if peer in NEED_WEIGHTS else args.keypoints
+    limits = Options(most, "image", 1, 0, args.reference_weights)
+    noisy = with_noisy_poses(judged) if reads_poses(peer) else None
+    rows: list[Row] = []
+    known: set[str] = set()
+    for pair, (_, measured) in zip(
+        judged.pairs, measure(peer, noisy or judged, limits, args.out / "found"), strict=True
+    ):
+        found = measured.found
+        answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
+        score = judged.truth.judge(*pair.images, *answer).row()
+        again = [s for image, s in zip(pair.images, measured.features_seconds, strict=True) if image in known]
+        known.update(pair.images)
+        rows.append({**{key: plain(score[key]) for key in _FIGURES}, "seconds": measured.seconds - sum(again)})
+    return rows

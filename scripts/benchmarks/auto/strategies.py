@@ -1,0 +1,53 @@
+"""auto with one strategy more, or another one, beside auto as it is, on the same blocks: whether it belongs into it.
+
+A strategy is worth its place where it brings 2 % more right matches at no lower correctness, or a fifth fewer wrong
+ones for 1 % fewer right ones at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from benchmarks.auto.blocks import ALL, CONDITIONS
+from benchmarks.auto.rendered import by_block, correct_beside, of_condition, right
+from benchmarks.auto.runs import JUDGED
+from benchmarks.tables import Row, code, grouped, markdown, percent, ratio, total
+
+MORE_RIGHT, FEWER_WRONG, MOST_LOST = 1.02, 0.80, 0.99
+# Of the share of right matches: what counts as equal.
+_EQUAL = 0.001
+WORTH, NOT_WORTH = "in auto", "no gain"
+HEADS = ("strategy", "condition", "blocks", "right / auto's", "wrong / auto's", "correctness", "auto's", "verdict")
+
+
+def verdict(ours: Sequence[Row], arm: Sequence[Row]) -> str:
+    """The rule on the sums over the same pairs."""
+    more = ratio(total(arm, "correct"), total(ours, "correct"))
+    wrong = ratio(total(arm, "wrong"), total(ours, "wrong"))
+    equal = right(arm) >= right(ours) - _EQUAL
+    return WORTH if (more >= MORE_RIGHT and equal) or (wrong <= FEWER_WRONG and more >= MOST_LOST) else NOT_WORTH
+
+
+def table_of(rows: Sequence[Row]) -> str:
+    """A line for every strategy and condition."""
+    counted = [{**row, "wrong": (row["kept"] or 0.0) - (row["correct"] or 0.0)} for row in rows]
+    ours = by_block([row for row in counted if row["method"] == JUDGED])
+    lines = []
+    for (method,), every in grouped([row for row in counted if row["method"] != JUDGED], "method"):
+        for condition in (*CONDITIONS, ALL):
+            arm = of_condition(every, condition)
+            if not arm:
+                continue
+            blocks = by_block(arm)
+            beside = [row for name in blocks for row in ours[name]]
+            lines.append(
+                [code(method), condition, len(blocks), correct_beside(arm, beside),
+                 correct_beside(arm, beside, "wrong"), percent(right(arm), 1), percent(right(beside), 1),
+                 verdict(beside, arm)]
+            )  # fmt: skip
+    return markdown(HEADS, lines)
+
+
+def asked_of(strategies: Sequence[str]) -> list[str]:
+    """Settings of auto that name one strategy each, as methods."""
+    return [text if text.startswith(JUDGED) else f"{JUDGED}[{text}]" for text in strategies]

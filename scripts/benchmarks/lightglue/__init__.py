@@ -1,1 +1,0 @@
-"""`bench lightglue`: what the network finds beside the ratio test, and what it costs."""

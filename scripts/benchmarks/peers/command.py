@@ -1,0 +1,170 @@
+"""This project's presets beside other people's programs: same pairs, images, size and budget, judged by truth.
+
+A method is a peer or a preset, with settings in brackets as in `--set`, and a label before it where the name gets long:
+'opencv-sift,plain=fusion[enhance=none]'. Peers that are networks take part where --reference-weights has their weights.
+Sections: rendered, scenes (one block of each of --flights) that are judged by their exact geometry; real, blocks
+(DATA/BLOCK/images, DATA/BLOCK/reference) that are judged by the epipolar lines of their reference poses. All have exact
+poses; pairs overlap by a fifth at least, a quarter of each class of view angle where a scene has as many.
+
+Correct: matches a pair within 3 px, after thinning them one-to-one to 2 px. Right: of the kept ones. Recall: of the
+keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. First / it:
+correct matches of the first of --methods over those of this one, on the same pairs. Error: median of the pairs'
+medians. Seconds: median of pairs, features of both images included, decoding too; start-up is not timed. In brackets:
+90 % intervals by bootstrap over pairs. OUT keeps what every method answered: what depends on nothing that changed is
+not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
+from benchmarks import options, stamps
+from benchmarks.peers.base import Options
+from benchmarks.peers.table import NEED_WEIGHTS, PEERS, Named, check_method, named_methods, settings_of
+from benchmarks.peers.worker import measure
+from benchmarks.processes import limit_threads
+from benchmarks.scenes import Judged, Selection, real, rendered_scenes
+from benchmarks.tables import (
+    Column,
+    Row,
+    code,
+    grouped,
+    interval,
+    means,
+    median,
+    number,
+    percent,
+    plain,
+    ranged,
+    ratio,
+    ratio_of_sums,
+    table,
+    write_rows,
+)
+
+THREADS = 2
+ENOUGH_CORRECT = 30
+METHODS = (
+    "oblique,fusion,baseline,SIFT=opencv-sift,ASIFT=opencv-asift,pycolmap,pycolmap-guided,keynet,aliked,aliked@ground"
+)
+_FIGURES = ("possible", "kept", "correct", "median_error_px")
+
+
+def asked_scenes(args: argparse.Namespace) -> Iterator[Judged]:
+    """One after the other, each made when it is needed."""
+    if "scenes" in args:
+        yield from (judged for _, judged in rendered_scenes(args, "angles"))
+    for block in args.blocks if "blocks" in args else ():
+        selection = Selection("angles", args.pairs, args.seed)
+        yield real(args.out / "scenes", args.data, block, selection, max_size_px=args.max_size)
+
+
+def rows_of(args: argparse.Namespace, methods: Sequence[Named]) -> Iterator[Row]:
+    """Of every method on every scene, pair by pair."""
+    limits = Options(args.keypoints, "image", THREADS, args.seed, args.reference_weights)
+    for judged in asked_scenes(args):
+        for name in methods if judged.pairs else ():
+            print(f"{judged.scene.name}: {name.label}, {len(judged.pairs)} pairs", file=sys.stderr, flush=True)
+            answers = measure(name.spec, judged, limits, args.out / "found")
+            for pair, (_, measured) in zip(judged.pairs, answers, strict=True):
+                found = measured.found
+                answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
+                score = judged.truth.judge(*pair.images, *answer).row()
+                head = {"method": name.label, "scene": judged.scene.name, "pair": " ".join(pair.images)}
+                head |= {"view_angle": class_of(pair.conditions.view_angle_deg, VIEW_ANGLE_CLASSES)}
+                yield {**head, **{key: plain(score[key]) for key in _FIGURES}, "seconds": plain(measured.seconds)}
+
+
+def _correct(rows: Sequence[Row]) -> str:
+    correct = [row["correct"] or 0.0 for row in rows]
+    return ranged(float(np.mean(correct)), interval(correct, means), 0)
+
+
+def _share(rows: Sequence[Row], whole: str) -> str:
+    """Of correct matches, in sums, with its interval."""
+    known = [(row["correct"] or 0.0, row[whole]) for row in rows if row[whole] is not None]
+    if not known:
+        return "-"
+    low, high = interval(known, ratio_of_sums)
+    return ranged(100.0 * ratio(*np.sum(known, axis=0)), (100.0 * low, 100.0 * high), 1, " %")
+
+
+COLUMNS: tuple[Column[Sequence[Row]], ...] = (
+    ("pairs", len),
+    ("correct", _correct),
+    ("right", lambda rows: _share(rows, "kept")),
+    ("recall", lambda rows: _share(rows, "possible")),
+    (f">= {ENOUGH_CORRECT} correct", lambda rows: percent(np.mean([r["correct"] >= ENOUGH_CORRECT for r in rows]))),
+    ("error px", lambda rows: number(median(rows, "median_error_px"), 2)),
+    ("s", lambda rows: number(median(rows, "seconds"), 2)),
+)
+
+
+def table_of(rows: Sequence[Row]) -> str:
+    """A line for every class of view angle and method, and for all of them."""
+    first = rows[0]["method"]
+    of_first = {(row["scene"], row["pair"]): row["correct"] or 0.0 for row in rows if row["method"] == first}
+
+    def beside_first(own: Sequence[Row]) -> str:
+        pairs = [(of_first[row["scene"], row["pair"]], row["correct"] or 0.0) for row in own]
+        return ranged(ratio(*np.sum(pairs, axis=0)), interval(pairs, ratio_of_sums), 2)
+
+    columns = [*COLUMNS[:2], (f"`{first}` / it", beside_first), *COLUMNS[2:]]
+    groups = []
+    for name in (*(name for name, _ in VIEW_ANGLE_CLASSES), "all"):
+        members = [row for row in rows if name in (row["view_angle"], "all")]
+        groups += [((name, code(method)), own) for (method,), own in grouped(members, "method")]
+    return table(("view angle", "method"), groups, columns)
+
+
+def with_weights(methods: Sequence[Named], weights: Path | None) -> list[Named]:
+    """Those that can be run: without a folder of weights no networks of others, which is said."""
+    left = [name for name in methods if weights is not None or name.spec not in NEED_WEIGHTS]
+    if without := [name.label for name in methods if name not in left]:
+        print(f"without --reference-weights DIR left out: {', '.join(without)}", file=sys.stderr)
+    return left
+
+
+def main(arguments: Sequence[str]) -> None:
+    section, rest = options.section_of("peers", __doc__, ("rendered", "real"), arguments)
+    parser = options.make_parser(f"peers {section}", __doc__)
+    add = parser.add_argument
+    add("--methods", default=METHODS, help=f"comma-separated: {', '.join(PEERS)}, or presets")
+    quick: dict[str, object] = {"pairs": 3, "keypoints": 512}
+    if section == "rendered":
+        scenes = "city,suburb,hills"
+        options.add_rendered(parser, scenes=scenes, pairs=8, size="800x600", images=12, flights="oblique")
+        quick |= {"scenes": "suburb", "size": "480x360", "images": 10}
+    else:
+        add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
+        add("--blocks", type=options.names, default="lewis,ochota", help="names, comma-separated")
+        add("--pairs", type=options.positive, default=8, help="of each block")
+        add("--max-size", type=options.positive, default=1000, help="longer side of images, px")
+        add("--seed", type=int, default=0, help="another seed gives other pairs")
+        quick |= {"blocks": "lewis", "max_size": 500}
+    add("--keypoints", type=options.positive, default=2048, help="descriptors per image, exactly")
+    add("--reference-weights", type=Path, metavar="DIR", help=f"weights of {', '.join(NEED_WEIGHTS)}")
+    options.add_output(parser)
+    args = options.parse(parser, rest, quick)
+    limit_threads(THREADS)
+    methods = named_methods(args.methods)
+    for name in methods:
+        check_method(name.spec)
+    methods = with_weights(methods, args.reference_weights)
+    rows: list[Row] = []
+    for row in rows_of(args, methods):
+        rows.append(row)
+        write_rows(args.out / f"{section}.json", rows)
+    if not rows:
+        raise ConfigError("no scene has a pair that overlaps: give another --seed")
+    options.publish(
+        args, table_of(rows) + "\n", args.out / f"{section}.md", table=f"bench_peers_{section}",
+        command=options.command_line(parser, args), versions=stamps.of_matching(*settings_of(methods)),
+    )  # fmt: skip

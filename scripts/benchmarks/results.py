@@ -1,0 +1,94 @@
+"""Makes the tables of docs/results: runs the standing benchmarks one after the other, each in processes of its own.
+
+All of them take two hours on two idle cores. Every benchmark goes on where it was, as long as the code is the same: OUT
+has a folder for each state of aeromatch_cli. A benchmark that fails does not keep the others from being run. With
+--docs the tables are written into their pages, and their figures into the README.
+"""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks import figures, options
+from benchmarks.sources import code_digest
+from benchmarks.stamps import REPOSITORY
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A page of docs/results. minutes: planned, on two idle cores. runs: the text of commands after `scripts/bench`, in
+    which DATA and WEIGHTS stand for folders."""
+
+    page: str
+    minutes: int
+    runs: tuple[str, ...]
+
+
+STANDING: Mapping[str, Standing] = {
+    "auto": Standing("auto.md", 45, ("auto rendered", "auto strategies", "auto real --data DATA")),
+    "claims": Standing("claims.md", 20, ("claims --seed 1 --data DATA --reference-weights WEIGHTS",)),
+    "peers": Standing(
+        "peers.md",
+        15,
+        ("peers rendered --reference-weights WEIGHTS", "peers real --data DATA --reference-weights WEIGHTS"),
+    ),
+    "calibration": Standing("calibration.md", 10, ("calibration",)),
+    "orientation": Standing("orientation.md", 10, ("orientation real --data DATA", "orientation rendered")),
+    "growth": Standing("growth.md", 6, ("growth",)),
+    "speed": Standing("speed.md", 10, ("speed",)),
+    "robustness": Standing("robustness.md", 4, ("robustness",)),
+}
+
+
+def words(run: str, given: Mapping[str, str], *, docs: bool = False, quick: bool = False) -> list[str]:
+    """Arguments of `scripts/bench` for one run. Without weights their option is left out; every benchmark has a folder
+    of its name in OUT."""
+    text = run if "WEIGHTS" in given else run.removesuffix(" --reference-weights WEIGHTS")
+    found = [given.get(word, word) for word in shlex.split(text)]
+    found += ["--out", str(Path(given["OUT"]) / found[0])]
+    return [*found, *(["--docs"] if docs else []), *(["--quick"] if quick else [])]
+
+
+def main(arguments: Sequence[str]) -> int:
+    parser = options.make_parser("results", __doc__)
+    add = parser.add_argument
+    add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
+    add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks; else without")
+    add("--only", type=options.names, default=",".join(STANDING), help="comma-separated")
+    add("--docs", action="store_true", help="write the tables into docs/results and their figures into the README")
+    add("--list", action="store_true", help="print the commands and their planned minutes instead of running them")
+    add("--quick", action="store_true", help="all of them small: figures without worth, in minutes")
+    add("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
+    args = options.parse(parser, arguments)
+    if unknown := sorted(set(args.only) - set(STANDING)):
+        parser.error(f"--only: {', '.join(unknown)} are none of {', '.join(STANDING)}")
+    given = {"DATA": str(args.data.resolve()), "OUT": str(args.out.resolve() / code_digest("")[:8])}
+    if args.reference_weights:
+        given["WEIGHTS"] = str(args.reference_weights.resolve())
+    failed = []
+    for name in args.only:
+        standing, started = STANDING[name], time.monotonic()
+        print(f"# {name}: about {standing.minutes} minutes", flush=True)
+        for run in standing.runs:
+            asked = words(run, given, docs=args.docs, quick=args.quick)
+            print(shlex.join(["scripts/bench", *asked]), flush=True)
+            if not args.list and _run(asked):
+                failed.append(shlex.join(["scripts/bench", *asked]))
+        if not args.list:
+            print(f"# {name}: {(time.monotonic() - started) / 60.0:.1f} minutes", flush=True)
+    if args.docs and not args.list:
+        figures.write_readme()
+    for command in failed:
+        print(f"failed: {command}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _run(asked: Sequence[str]) -> int:
+    command = [sys.executable, "-m", "benchmarks", *asked]
+    return subprocess.run(command, cwd=REPOSITORY / "scripts", stdout=subprocess.DEVNULL, check=False).returncode

@@ -1,0 +1,138 @@
+"""scripts/bench auto: conditions, under-exposed pictures, the rule for strategies and the tables, by hand; a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from benchmarks import __main__ as launcher
+from benchmarks.auto import blocks, command, real, rendered, runs, strategies
+
+Row = dict[str, Any]
+
+
+def rows(method: str, place: str, correct: list[int], kept: list[int]) -> list[Row]:
+    block = blocks.Block(place, 1)
+    head = {"block": block.name, "conditions": block.conditions, "method": method, "seconds": 2.0}
+    return [head | {"correct": c, "kept": k, "median_error_px": 0.5} for c, k in zip(correct, kept, strict=True)]
+
+
+def test_every_block_is_of_its_conditions() -> None:
+    assert blocks.Block("farmland:nadir", 3).conditions == ["texture-poor", "rows and facades", "all"]
+    assert blocks.Block("city:exposed", 1).nadir
+    assert not blocks.Block("city:oblique", 1).nadir
+    assert len(blocks.PLACES) == len(set(blocks.PLACES))
+
+
+def test_every_second_picture_gets_an_eighth_of_the_light(tmp_path: Path) -> None:
+    block = tmp_path / "grass"
+    (block / "images").mkdir(parents=True)
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        cv2.imwrite(str(block / "images" / name), np.full((64, 64, 3), 180, np.uint8))
+    (block / "truth.json").write_text("{}")
+    out = blocks.under_exposed(block)
+    means = [cv2.imread(str(path)).mean() for path in sorted((out / "images").iterdir())]
+    assert means == pytest.approx([180.0, 180.0 * 0.125 ** (1 / 2.2), 180.0], abs=1.0)
+    assert (out / "truth.json").read_text() == "{}"
+    assert blocks.under_exposed(block) == out  # made once
+    assert cv2.imread(str(block / "images" / "b.jpg")).mean() == pytest.approx(180.0, abs=1.0)
+
+
+def test_methods_stand_beside_auto_on_the_blocks_that_they_have() -> None:
+    found = [
+        *rows("auto", "suburb:nadir", [90, 60], [100, 60]), *rows("auto", "city:mixed", [40, 50], [50, 50]),
+        *rows("polar", "suburb:nadir", [30, 20], [40, 20]),
+        *rows("baseline", "suburb:nadir", [45, 30], [50, 30]), *rows("baseline", "city:mixed", [20, 25], [20, 30]),
+    ]  # fmt: skip
+    lines = rendered.table_of(found).splitlines()
+    whole = "| all | `auto` | 2 | 4 | 240 | 92.3 % (82.4 to 98.0) | 90.0 % (city:mixed, seed 1) | 0.50 |  | 8 |"
+    assert [line.split("(")[0] for line in lines if line.startswith("| all | `auto`")] == [whole.split("(")[0]]
+    polar = next(line for line in lines if line.startswith("| all | `polar`"))
+    assert polar.startswith("| all | `polar` | 1 | 2 | 50 | 83.3 % ")
+    assert polar.endswith("| 0.50 | 3.00 (3.00 to 3.00) | 4 |")
+    suns = next(line for line in lines if line.startswith("| two suns | `baseline`"))
+    assert suns.endswith("| 90.0 % (city:mixed, seed 1) | 0.50 | 2.00 (2.00 to 2.00) | 4 |")
+
+
+@pytest.mark.parametrize(
+    ("correct", "kept", "expected"),
+    [
+        (1020, 1071, strategies.WORTH),  # 2 % more at the same share
+        (1019, 1070, strategies.NOT_WORTH),
+        (1100, 1200, strategies.NOT_WORTH),  # more, and more of them wrong
+        (990, 1030, strategies.WORTH),  # 40 instead of 50 wrong ones
+        (990, 1031, strategies.NOT_WORTH),
+        (980, 1000, strategies.NOT_WORTH),  # fewer wrong ones, 2 % fewer right ones
+    ],
+)
+def test_the_rule_for_strategies(correct: int, kept: int, expected: str) -> None:
+    ours = [{"correct": 1000, "kept": 1050, "wrong": 50}]
+    assert strategies.verdict(ours, [{"correct": correct, "kept": kept, "wrong": kept - correct}]) == expected
+
+
+def test_strategies_have_a_verdict_by_condition() -> None:
+    found = [*rows("auto", "suburb:nadir", [90, 60], [100, 70]), *rows("auto", "city:mixed", [40, 50], [50, 50])]
+    better, worse = [90, 60], [95, 65]
+    found += rows("auto[x=y]", "suburb:nadir", better, worse) + rows("auto[x=y]", "city:mixed", [10, 50], [50, 50])
+    lines = strategies.table_of(found).splitlines()[2:]
+    assert lines[0].startswith(
+        "| `auto[x=y]` | one sun | 1 | 1.00 (1.00 to 1.00) | 0.50 (0.50 to 0.50) | 93.8 % | 88.2 %"
+    )
+    assert [line.rsplit("|", 2)[1].strip() for line in lines] == ["in auto", "no gain", "no gain"]
+    assert strategies.asked_of(["cascade=guided", "auto[a=b,c=d]"]) == ["auto[cascade=guided]", "auto[a=b,c=d]"]
+
+
+def test_images_in_our_model_stand_beside_the_most_of_any_mapper() -> None:
+    def mapped(images: int, points: int) -> Row:
+        return {"registered": images, "points": points, "right": images, "reprojection_error_px": 0.5, "seconds": 9.0}
+
+    own = {"registered": 8, "right": 8, "points": 300, "reprojection_error_px": 0.7, "seconds": 20.0}
+    head = {"block": "lewis", "every": 4, "preset": "auto", "images": 9, **own}
+    first = head | {"given": "nothing", "by_incremental": 7, "by_global": 9}
+    second = head | {"given": "positions", "by_incremental": 8, "by_global": 8}
+    peer = {"incremental": mapped(6, 100), "global": mapped(8, 150)}
+    text = real.table_of([first | {"pycolmap": peer}, second | {"pycolmap": peer}])
+    assert "all cases: 2.00 (2.00 to 2.00)" in text
+    assert ": 0.94 (0.89 to 1.00); fewer in 1 of 2 cases." in text
+    line = "| lewis / 4 | nothing | `auto` | 9 | 8 | 8 | 7 / 9 | 6 / 8 | 8 | 300 | 150 | 0.70 | 0.50 | 20 | 9 |"
+    assert line in text
+
+
+def test_what_cannot_be_measured_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, said in (
+        (["rendered", "--methods", "baseline"], "must hold auto"),
+        (["rendered", "--places", "moon:nadir"], "moon:nadir"),
+        (["real", "--data", "d", "--given", "all"], "all are none"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            command.main([*words, "--out", "nowhere"])
+        assert stopped.value.code == 2
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_strategy_goes_on_from_the_workspace_of_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[Path | None] = []
+    run = runs.whole_run
+
+    def watched(*given: Any, **more: Any) -> Any:
+        started.append(more["start"])
+        return run(*given, **more)
+
+    monkeypatch.setattr(runs, "whole_run", watched)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_LOG_LEVEL"):
+        monkeypatch.setenv(name, "1")
+    asked = ["auto", "strategies", "--quick", "--places", "suburb:nadir", "--jobs", "1", "--out", str(tmp_path)]
+    asked += ["--strategies", "filter=epipolar+graph"]
+    assert launcher.main(asked) == 0
+    assert [start is not None and start.parent.name for start in started] == [False, "auto"]
+    found = json.loads((tmp_path / "strategies.json").read_text(encoding="utf-8"))
+    correct = {name: sum(r["correct"] for r in found if r["method"] == name) for name in {r["method"] for r in found}}
+    assert correct["auto"] > 500
+    assert 0.8 * correct["auto"] < correct["auto[filter=epipolar+graph]"] <= correct["auto"]
+    assert launcher.main(asked) == 0
+    assert len(started) == 2  # nothing was run again
