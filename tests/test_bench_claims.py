@@ -149,16 +149,17 @@ def test_claims_are_judged_against_the_papers_own_baseline():
             "error_sum_px": error_px * kept, "correct_error_sum_px": 0.0,
         }  # fmt: skip
 
-    rows = [
+    single = [
         row(shadow.PAPER, "homography 3 px", 100, 25, 2.0),
         row(shadow.WHOLE, shadow.OWN, 400, 0, 0.5),
         row(shadow.STEP, shadow.CLUSTERED, 220, 20, 1.0),
     ]
     # Direct RANSAC keeps 50 correct matches more per pixel: 5 px are needed for as many as clustered RANSAC.
-    rows += [row(shadow.STEP, f"homography {px} px", 50 * px, 10 * px, float(px)) for px in shadow.SWEPT_PX]
+    single += [row(shadow.STEP, f"homography {px} px", 50 * px, 10 * px, float(px)) for px in shadow.SWEPT_PX]
+    rows = [one | {"pair": pair} for one in single for pair in ("a b", "c d")]
     text = page.tables(rows)
     assert cells(text, "A1")[2:] == [
-        "100 correct", "150 correct: 1.50 x (1.50 x to 1.50 x)", "400 correct: 4.00 x (4.00 x to 4.00 x)",
+        "200 correct", "300 correct: 1.50 x (1.50 x to 1.50 x)", "800 correct: 4.00 x (4.00 x to 4.00 x)",
         "step missed, whole beaten",
     ]  # fmt: skip
     assert cells(text, "A2")[2:4] == ["3.00 px (homography 3 px)", "1.00 px: -66.7 % (-66.7 % to -66.7 %)"]
@@ -184,10 +185,11 @@ def test_times_and_features_are_compared_and_what_is_missing_is_not_run():
     rows = [known("grass", 100.0, 1.0, 50.0), known("sand", 50.0, 0.5, 25.0)]
     rows += [method(name, 20) for name in features.RIVALS if name != features.SUPERPOINT]
     rows += [method(features.STEP, 10), method(features.WHOLE, 60)]
+    rows += [row | {"pair": "c d"} for row in rows if row["paper"] == "C"]
     text = page.tables(rows)
     assert cells(text, "B1")[3:] == [
         "0.75 s: -99.0 % (-99.0 % to -99.0 %)", "37.50 s: -50.0 % (-50.0 % to -50.0 %)", "step beaten, whole missed",
     ]  # fmt: skip
     assert cells(text, "B2")[5] == "step missed, whole beaten"
-    assert cells(text, "C1")[4:] == ["60: 3.00 x (3.00 x to 3.00 x)", "step missed, whole beaten"]
+    assert cells(text, "C1")[4:] == ["120: 3.00 x (3.00 x to 3.00 x)", "step missed, whole beaten"]
     assert cells(text, features.SUPERPOINT) == [features.SUPERPOINT, *["not run"] * 6]

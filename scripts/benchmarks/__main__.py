@@ -22,7 +22,7 @@ TABLE: Table = {
     ),
     "claims": (
         "benchmarks.claims.command",
-        "the papers' claims beside their own baselines, and ablations of single steps, by exact truth",
+        "the papers' claims beside their baselines, and ablations, by truth",
     ),
     "growth": ("benchmarks.growth", "seconds and memory of every stage against the number of images"),
     "speed": ("benchmarks.speed", "seconds and memory of whole runs beside pycolmap, by stage"),

@@ -8,33 +8,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, IntArray
-from benchmarks.tables import Row
+from benchmarks.tables import Row, interval
 
-DRAWS, COVERED = 2000, 0.90
 # Of the rows of pairs, by their positions (..., N), drawn with replacement: figures (...).
 Statistic = Callable[[IntArray], FloatArray]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Value of a statistic over all pairs, and the interval that holds 90 % of those over pairs drawn again."""
+    """Value of a statistic over all pairs, and its 90 % interval."""
 
     value: float
     low: float
     high: float
 
     def said(self, form: Callable[[float], str]) -> str:
+        if not np.isfinite(self.low):
+            return form(self.value)
         return f"{form(self.value)} ({form(self.low)} to {form(self.high)})"
 
 
-def estimate(statistic: Statistic, pairs: int, seed: int = 0) -> Estimate:
-    """Percentile bootstrap over pairs. Draws without a value are left out; NaN without any."""
-    rng = np.random.default_rng(seed)
-    drawn = statistic(rng.integers(0, pairs, (DRAWS, pairs)))
-    drawn = drawn[np.isfinite(drawn)]
-    tail = 50.0 * (1.0 - COVERED)
-    low, high = np.percentile(drawn, [tail, 100.0 - tail]) if len(drawn) else (np.nan, np.nan)
-    return Estimate(float(statistic(np.arange(pairs))), float(low), float(high))
+def estimate(statistic: Statistic, pairs: int) -> Estimate:
+    """Over pairs 0 to `pairs` - 1."""
+    every = np.arange(pairs)
+    return Estimate(float(statistic(every)), *interval(every, lambda drawn: statistic(drawn.astype(np.int64))))
 
 
 def verdict(found: Estimate | None, claimed: float, *, larger: bool) -> str:

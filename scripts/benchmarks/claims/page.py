@@ -20,10 +20,15 @@ from benchmarks.claims.intervals import (
     of_sums,
     verdict,
 )
-from benchmarks.tables import Row, code, factor, grouped, markdown, mean, median, number, percent, ratio, total, values
+from benchmarks.tables import Row, code, factor, grouped, markdown, median, number, percent, ratio, total, values
 
 Rows = Sequence[Row]
 NOT_RUN = "not run"
+
+
+def mean(rows: Rows, field: str) -> float:
+    """Over the rows that have a figure, NaN without any."""
+    return float(np.mean(found)) if (found := values(rows, field)) else float("nan")
 
 
 @dataclass(frozen=True)
