@@ -265,11 +265,11 @@ def _known_table(rows: Rows) -> str:
             right = [row for row in own if row[accepted]]
             figures = (
                 f"{median(right, f'{name}{field}'):{form}}" if right else "-"
-                for field, form in (("px", ".4f"), ("deg", ".5f"), ("scale", ".1e"))
+                for field, form in (("px", ".4f"), ("deg", ".5f"))
             )
             worst = f"{max(values(right, f'{name}px')):.4f}" if right else "-"
             lines.append((kind, said, f"{len(right)} of {len(own)}", *figures, worst))
-    heads = ("ground", "method", "registered", "displacement px, median", "degrees", "scale", "largest displacement px")
+    heads = ("ground", "method", "registered", "displacement px, median", "degrees", "largest displacement px")
     return markdown(heads, lines) if lines else ""
 
 

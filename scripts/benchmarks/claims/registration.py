@@ -30,7 +30,7 @@ CODE = (
     "benchmarks/claims/registration.py", "benchmarks/claims/grounds.py", "benchmarks/claims/sides.py",
 )  # fmt: skip
 PAIRS = 2
-RENDERED, REAL = ("grass", "farmland"), ("seneca", "caliterra")
+RENDERED, REAL = ("grass",), ("seneca", "caliterra")
 UNKNOWN_SIZE, UNKNOWN_IMAGES, UNKNOWN_PAIRS = "1840x1350", 5, 4
 GRID_SIZE, GRID_PAIRS, SAMPLES = (1840, 1350), 12, 20_000
 # How far off the start of a comparison of grids is: shift of the middle (share of the radius), turn, scale.
