@@ -31,13 +31,13 @@ CODE = (
 )  # fmt: skip
 PAIRS = 2
 RENDERED, REAL = ("grass",), ("seneca", "caliterra")
-UNKNOWN_SIZE, UNKNOWN_IMAGES, UNKNOWN_PAIRS = "1840x1350", 5, 4
+UNKNOWN_SIZE, UNKNOWN_IMAGES, UNKNOWN_PAIRS, LEAST_OVERLAP = "1840x1350", 5, 10, 0.3
 GRID_SIZE, GRID_PAIRS, SAMPLES = (1840, 1350), 12, 20_000
 # How far off the start of a comparison of grids is: shift of the middle (share of the radius), turn, scale.
 _NEAR, _FAR = (0.002, 0.05, 1.001), (0.01, 0.6, 1.01)
 _ALIKE_PX = 0.3  # of the finest level: a fit that ends nearer to the truth has found it
-_VERIFIED = 30  # matches of SIFT's that a comparison with it rests on
-_MOSTLY = 0.8
+COMPARED = 5  # pairs of each kind
+_FEWEST = 30  # right matches of SIFT's that a comparison with it rests on
 
 
 def units(seed: int, size: tuple[int, int], data: Path | None, out: Path) -> list[Unit]:
@@ -95,19 +95,19 @@ def unknown_rows(kind: str, seed: int, data: Path | None, out: Path) -> list[Row
         assert data is not None
         longest = int(UNKNOWN_SIZE.partition("x")[0])
         judged = real(out / "scenes", data, kind, Selection("all", UNKNOWN_PAIRS, seed), max_size_px=longest)
-    return [_unknown(judged, pair.images, kind) for pair in judged.pairs]
+    pairs = [pair for pair in judged.pairs if pair.conditions.overlap >= LEAST_OVERLAP]
+    return [_unknown(judged, pair.images, kind) for pair in pairs[:COMPARED]]
 
 
 def _unknown(judged: Judged, names: tuple[str, str], kind: str) -> Row:
     first, second = (read_pixels(judged.scene.images / name, colour=False) for name in names)
     mine, other = registered(first, second), sift(first, second)
     row: Row = {"paper": "B", "section": "unknown", "kind": kind, "pair": " ".join(names), "accepted": mine.accepted}
-    row |= {"sift_seconds": other.seconds, "sift_accepted": _right(judged, names, other)}
+    places, there = _right(judged, names, other)
+    row |= {"sift_seconds": other.seconds, "sift_accepted": len(places) >= _FEWEST}
     row |= dict(zip(("seconds", "exact_seconds", "tie_point_seconds"), mine.seconds, strict=True))
     if mine.accepted and row["sift_accepted"]:
-        places = other.points0[other.verified]
-        straight = closest_similarity(places, other.points1[other.verified])
-        row |= _by_registration(mine, places, straight)
+        row |= _by_registration(mine, places, closest_similarity(places, there))
     return {key: plain(value) for key, value in row.items()}
 
 
@@ -120,14 +120,13 @@ def _by_registration(mine: PolarResult, places: FloatArray, straight: FloatArray
     )
 
 
-def _right(judged: Judged, names: tuple[str, str], found: SiftResult) -> bool:
-    """Whether SIFT's verified matches are enough to compare with, and right by the block's truth."""
+def _right(judged: Judged, names: tuple[str, str], found: SiftResult) -> tuple[FloatArray, FloatArray]:
+    """Places (N, 2) in both pictures of SIFT's verified matches that are right by the block's truth."""
     verified = found.verified
-    if int(verified.sum()) < _VERIFIED:
-        return False
-    nothing, equal = np.zeros((0, 2)), np.ones(int(verified.sum()))
-    score = judged.truth.judge(*names, nothing, nothing, found.points0[verified], found.points1[verified], equal)
-    return score.correct >= _MOSTLY * score.kept
+    points0, points1 = found.points0[verified], found.points1[verified]
+    nothing, equal = np.zeros((0, 2)), np.ones(len(points0))
+    right = judged.truth.judge(*names, nothing, nothing, points0, points1, equal).correct_idx
+    return points0[right], points1[right]
 
 
 def plain_polar(radius_px: int, step_px: float) -> FloatArray:
