@@ -146,7 +146,7 @@ def test_claims_are_judged_against_the_papers_own_baseline():
         return {
             "paper": "A", "arm": arm, "chain": chain, "scene": "city", "pair": "a b", "suns": 1, "kept": kept,
             "under_exposed": False, "correct": correct, "wrong": wrong, "correct_in_shadow": correct, "errors": kept,
-            "error_sum_px": error_px * kept, "correct_error_sum_px": 0.0,
+            "error_sum_px": error_px * kept,
         }  # fmt: skip
 
     single = [

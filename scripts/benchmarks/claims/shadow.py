@@ -212,5 +212,4 @@ def _judged(given: Given, candidates: Candidates, chain: Sequence[Any], seed: in
         "kept": len(kept), "correct": int(correct.sum()), "wrong": int((~correct).sum()),
         "correct_in_shadow": int((correct & dark).sum()), "errors": len(errors),
         "error_sum_px": round(float(errors.sum()), 3),
-        "correct_error_sum_px": round(float(given.errors_px[kept][correct].sum()), 3),
     }  # fmt: skip
