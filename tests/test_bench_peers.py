@@ -104,10 +104,10 @@ def test_lines_hold_sums_and_the_first_method_beside() -> None:
     rows = [row("oblique", "a b", 100, 110), row("oblique", "a c", 20, 20)]
     rows += [row("SIFT", "a b", 40, 80), row("SIFT", "a c", 0, 0)]
     lines = command.table_of(rows).splitlines()
-    assert lines[0].startswith("| view angle | method | pairs | correct | right | `oblique` / it | recall |")
-    first = "| 40-60 | `oblique` | 2 | 60 (20 to 100) | 92.3 % (90.9 to 100.0) | 1.00 (1.00 to 1.00) |"
+    assert lines[0].startswith("| view angle | method | pairs | correct | `oblique` / it | right | recall |")
+    first = "| 40-60 | `oblique` | 2 | 60 (20 to 100) | 1.00 (1.00 to 1.00) | 92.3 % (90.9 to 100.0) |"
     assert lines[2].startswith(f"{first} 30.0 % (10.0 to 50.0) | 50 % | 0.40 | 2.00 |")
-    assert lines[3].startswith("| 40-60 | `SIFT` | 2 | 20 (0 to 40) | 50.0 % (50.0 to 50.0) | 3.00 (2.50 to inf) |")
+    assert lines[3].startswith("| 40-60 | `SIFT` | 2 | 20 (0 to 40) | 3.00 (2.50 to inf) | 50.0 % (50.0 to 50.0) |")
     assert lines[4].startswith("| all | `oblique` | 2 |")
 
 

@@ -184,7 +184,7 @@ def test_tables_depend_on_what_they_measure() -> None:
     assert not [key for key in chain if key.startswith("export.")]
     assert stamps.of_chain("auto", exported=True).keys() - chain.keys() == {"export.colmap"}
     matching = stamps.of_matching(load("oblique"))
-    assert not [key for key in matching if key.startswith(("stage.", "export."))]
+    assert not [key for key in matching if key.startswith(("stage.", "export.", "orient.", "refine.", "consistency."))]
 
 
 def test_training_blocks_are_those_of_the_cards() -> None:

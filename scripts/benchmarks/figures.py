@@ -68,7 +68,7 @@ RESULTS: Sequence[Result] = (
         "scripts/bench auto rendered",
     ),
     Result(
-        "Rendered pairs of five-camera flights above 60 degrees, 2048 descriptors an image",
+        "Rendered pairs above 60 degrees under two suns, 2048 descriptors an image",
         "`oblique` has {own} correct matches a pair, {right} right; {aliked} x ALIKED on the images as taken, {ground} "
         "x ALIKED on this project's ground views",
         {

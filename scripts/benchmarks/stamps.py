@@ -114,16 +114,16 @@ def of_pipeline() -> dict[str, Version]:
 
 
 def of_matching(*every: Settings) -> dict[str, Version]:
-    """Versions of all that the matches of some settings rest on, in a block that is oriented already."""
-    return of_settings(*every, families=[family for family in FAMILIES if family != "export"])
+    """Versions of all that the verified matches of pairs rest on whose poses are given."""
+    return of_settings(*every, families=("pairs", "enhance", "simulate", "extract", "match", "filter"))
 
 
 def of_chain(*methods: str, exported: bool = False) -> dict[str, Version]:
     """Versions of all that `aeromatch run` rests on with presets, PRESET or PRESET[key=value,...]. exported: whether
     the table shows what others make of the export."""
     every = [load(*parse_method(method)) for method in methods]
-    found = of_matching(*every) | (_ORIENTATION if every else {})
-    return found | (of_settings(*every, families=("export",)) if exported else {})
+    families = [family for family in FAMILIES if exported or family != "export"]
+    return of_settings(*every, families=families) | (_ORIENTATION if every else {})
 
 
 def of_strategies(family: str, *strategies: Strategy) -> dict[str, Version]:

@@ -140,13 +140,13 @@ def main(arguments: Sequence[str]) -> None:
     quick: dict[str, object] = {"pairs": 3, "keypoints": 512}
     if section == "rendered":
         scenes = "city,suburb,hills"
-        options.add_rendered(parser, scenes=scenes, pairs=8, size="800x600", images=12, flights="oblique")
-        quick |= {"scenes": "suburb", "size": "480x360", "images": 10}
+        options.add_rendered(parser, scenes=scenes, pairs=6, size="800x600", images=16, flights="mixed")
+        quick |= {"scenes": "suburb", "size": "480x360", "images": 8}
     else:
         add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
         add("--blocks", type=options.names, default="lewis,ochota", help="names, comma-separated")
-        add("--pairs", type=options.positive, default=8, help="of each block")
-        add("--max-size", type=options.positive, default=1000, help="longer side of images, px")
+        add("--pairs", type=options.positive, default=6, help="of each block")
+        add("--max-size", type=options.positive, default=800, help="longer side of images, px")
         add("--seed", type=int, default=0, help="another seed gives other pairs")
         quick |= {"blocks": "lewis", "max_size": 500}
     add("--keypoints", type=options.positive, default=2048, help="descriptors per image, exactly")
