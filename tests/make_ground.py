@@ -2,41 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
+from benchmarks.claims.sides import Shot
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.images.scaling import shrink
-
-
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """A decoded picture (H, W) as a `data.Raster`, and where it is valid (None = everywhere)."""
-
-    pixels: NDArray[Any]
-    valid: BoolArray | None = None
-    finest: float = 1.0
-
-    @property
-    def width_px(self) -> int:
-        return self.pixels.shape[1]
-
-    @property
-    def height_px(self) -> int:
-        return self.pixels.shape[0]
-
-    def reduced(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
-        if scale > self.finest:
-            raise ValueError(f"asked for scale {scale:g}, nothing is finer than {self.finest:g}")
-        small = shrink(self.pixels, scale).astype(np.float32)
-        if self.valid is None:
-            return small, None
-        return small, shrink(self.valid.astype(np.uint8) * 255, scale) > 254
+from aeromatch_cli.data import FloatArray
 
 
 @lru_cache(maxsize=8)

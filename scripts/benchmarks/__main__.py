@@ -20,7 +20,10 @@ TABLE: Table = {
         "benchmarks.orientation.command",
         "orientation from the pictures where given poses and cameras are wrong",
     ),
-    "claims": ("benchmarks.claims.command", "the papers' claims and what brings them, by exact truth"),
+    "claims": (
+        "benchmarks.claims.command",
+        "the papers' claims beside their baselines, and ablations, by truth",
+    ),
     "growth": ("benchmarks.growth", "seconds and memory of every stage against the number of images"),
     "speed": ("benchmarks.speed", "seconds and memory of whole runs beside pycolmap, by stage"),
     "robustness": (

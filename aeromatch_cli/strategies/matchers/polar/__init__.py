@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 from aeromatch_cli.data import Features, FloatArray, IntArray, Matches, PairGeometry, Raster
 from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.matchers.polar.points import Limits, TiePoints, tie_points
+from aeromatch_cli.strategies.matchers.polar.points import Limits, TiePoints, lattice, tie_points
 from aeromatch_cli.strategies.matchers.polar.pyramid import Pyramid
 from aeromatch_cli.strategies.matchers.polar.registration import SCALES, Prior, Registration, register
 from aeromatch_cli.strategies.matchers.polar.sides import Side, grounded
@@ -28,6 +28,10 @@ from aeromatch_cli.strategies.matchers.polar.sides import Side, grounded
 _LEAST_UNPOSED_OVERLAP = 0.3
 # Of a similarity from tie points: standard deviations are no smaller, and weights are settled in so many rounds.
 _LEAST_SIGMA_PX, _ROUNDS = 0.02, 5
+# Windows of full-size pixels that a similarity is measured in: about so many, half their side, and the fewest. They
+# hold 16 times the pixels of a tie point's, so that noise counts less, and their correlation may be lower.
+_PATCHES, _PATCH_HALF, _LEAST_PATCHES = 100, 40, 12
+_PATCH_LIMITS = Limits(_PATCH_HALF, 0.2, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +59,12 @@ class Measured:
     points1_px: FloatArray
     correlations: FloatArray
     sigmas_px: FloatArray
+
+    @property
+    def sigma_px(self) -> float:
+        """Of the similarity's shift, from the points' own; infinite without points."""
+        weight = float((1.0 / np.maximum(self.sigmas_px, _LEAST_SIGMA_PX) ** 2).sum())
+        return float(np.sqrt(1.0 / weight)) if weight else float("inf")
 
     def similarity(self) -> FloatArray:
         """(3, 3) similarity of stored pixels, image 1 from image 0, by least squares over the tie points.
@@ -163,6 +173,26 @@ class Polar(Strategy):
         levels = Pyramid(side0.read, side1.read, longest, min(side0.finest, side1.finest))
         registration = register(levels, prior, (self.min_scale, self.max_scale))
         return Registered(side0, side1, levels, registration)
+
+    def exact(self, found: Registered) -> FloatArray:
+        """(3, 3) similarity of stored pixels, image 1 from image 0, of an accepted registration measured once more.
+
+        That of the registration ends on reduced pictures. Here about 100 windows of full-size pixels, spread over the
+        overlap, are measured by least squares. Where they say less than the registration (noise, no detail that small),
+        its own is given, of tilted pictures the closest.
+        """
+        side0, side1, registration = found.side0, found.side1, found.registration
+        places = lattice(side0, side1, registration.warp, _PATCHES, 2 * _PATCH_HALF)
+        points = tie_points(side0, side1, found.levels, registration, places, _PATCH_LIMITS)
+        patches = Measured(points.rows, places[points.rows], points.places_px, points.correlations, points.sigmas_px)
+        fit = registration.fit
+        own = np.inf if fit is None else float(np.sqrt(np.trace(fit.covariance[:2, :2]))) / registration.scale
+        if len(points.rows) >= _LEAST_PATCHES and patches.sigma_px < own:
+            return patches.similarity()
+        if side0.camera is None or len(places) < 2:
+            return registration.matrix
+        there = apply_homography(registration.warp, side0.frame_from_source(places))
+        return closest_similarity(places, side1.source_from_frame(there))
 
     def measured(self, found: Registered, grid0_px: FloatArray, grid1_px: FloatArray) -> Measured:
         """Points (K, 2) of either image, stored pixels, measured in the other: so that every image's points are seen in

@@ -14,6 +14,7 @@ composition of steps, Baker and Matthews, IJCV 56(3), 2004.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -24,6 +25,8 @@ from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.strategies.matchers.polar.level import Level, bilinear_at
 
+# Offsets (S, 2) from the middle, px, to a radius; each sample stands for the square of the second number, about.
+Grid = Callable[[int, float], FloatArray]
 _INNERMOST = 6  # samples of the innermost ring
 _TUKEY = 4.0  # residuals beyond so many standard deviations weigh nothing
 _CONVERGED_PX = 2e-3  # at the edge of the grid, level px
@@ -152,9 +155,10 @@ def fit(
     samples: int,
     still_px: float = _CONVERGED_PX,
     tilted: bool = False,
+    grid: Grid | None = None,
 ) -> Fit | None:
     """From a start (3, 3) between level px; None where too little is shared. samples: about so many. still_px: a step
-    that moves the edge by less is the last.
+    that moves the edge by less is the last. grid: another than the dynamic polar one, for comparisons.
     """
     shared = overlap_of(level0, level1, start)
     if shared is None:
@@ -163,7 +167,7 @@ def fit(
     step = max(1.0, float(np.sqrt(shared.share * width * height / samples)))
     if shared.radius_px < 2.0 * step:
         return None
-    offsets = _rings(round(shared.radius_px), round(step, 2))
+    offsets = (grid or _rings)(round(shared.radius_px), round(step, 2))
     planes0, known0 = level0.sample(offsets + shared.middle_px)
     problem = _Problem(level1, offsets[known0], planes0[known0, 0], shared, 8 if tilted else 4)
     matrix, light, moved, linear = start, None, np.inf, None

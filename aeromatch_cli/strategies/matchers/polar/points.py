@@ -34,6 +34,7 @@ _NEIGHBOURS = 10
 _LEAST_CORRELATION = 0.3
 # What may be off: so many times what the neighbours scatter, and never more than so many times what always may.
 _DEVIATIONS, _MOST = 4.0, 3.0
+_PROBES = 4000  # places across side 0 that the area of the overlap is found from
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,23 @@ def tie_points(
     good = last.matched & (last.correlations >= limits.correlation) & (last.sigmas_px <= limits.sigma_px)
     good &= _inside(last.places1_px, side1.raster)
     return _found(rows[good], last.take(good))
+
+
+def lattice(side0: Side, side1: Side, warp: FloatArray, count: int, rim_px: int) -> FloatArray:
+    """About `count` places (N, 2), stored pixels of image 0, on an even grid over what image 1 shows too.
+
+    warp: (3, 3) homography between the frames that says so. rim_px: least distance from the rims of both images.
+    """
+    size = np.array([side0.raster.width_px, side0.raster.height_px], float)
+
+    def usable(step_px: float) -> FloatArray:
+        xs, ys = (np.arange(rim_px + 0.5 * step_px, length - rim_px, step_px) for length in size)
+        places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+        there = side1.source_from_frame(apply_homography(warp, side0.frame_from_source(places)))
+        return places[_inside(there, side1.raster, rim_px)]
+
+    probing = float(np.sqrt(size.prod() / _PROBES))
+    return usable(probing * float(np.sqrt(max(len(usable(probing)), 1) / count)))
 
 
 def _found(rows: IntArray, windows: Windows) -> TiePoints:
@@ -174,10 +192,10 @@ def _window(raster: Raster, places_px: FloatArray, reach: int) -> tuple[Level, F
     return level_of(pixels, valid, 1.0, even=False), low.astype(np.float64)
 
 
-def _inside(points_px: FloatArray, raster: Raster) -> BoolArray:
+def _inside(points_px: FloatArray, raster: Raster, rim_px: int = 0) -> BoolArray:
     size = np.array([raster.width_px, raster.height_px])
     with np.errstate(invalid="ignore"):
-        return np.asarray(((points_px >= 0.0) & (points_px <= size - 1.0)).all(axis=1))
+        return np.asarray(((points_px >= rim_px) & (points_px <= size - 1.0 - rim_px)).all(axis=1))
 
 
 def searched(level0: Level, level1: Level, start: Windows, half: int, reach: int) -> Windows:
