@@ -28,12 +28,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.config import load
 from aeromatch_cli.files import write_json
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap, resized
 from benchmarks import options, stamps
-from benchmarks.memory import peak_mb
-from benchmarks.processes import children_seconds
+from benchmarks.processes import children_seconds, run_watched
 from benchmarks.scenes import render_once
 from benchmarks.stamps import REPOSITORY
 from benchmarks.tables import Row, code, factor, markdown, number, percent, ratio, write_rows
@@ -112,7 +110,7 @@ def timed(command: Sequence[str], log: Path) -> tuple[Row, dict[str, Any]]:
     """Figures of a command, and the JSON object that it prints as its last line. SystemExit where it fails."""
     log.parent.mkdir(parents=True, exist_ok=True)
     used_s = children_seconds()
-    exit_code, seconds, peak = peak_mb(command, log)
+    exit_code, seconds, peak = run_watched(command, log)
     answers = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line[:1] == "{"]
     if exit_code not in (0, 1) or not answers:
         raise SystemExit(f"{' '.join(command[:5])} ended with exit code {exit_code}: see {log}")
@@ -214,8 +212,7 @@ def main(arguments: Sequence[str]) -> None:
         rows.append(row)
         write_rows(kept, rows)
         print(json.dumps(row), file=sys.stderr, flush=True)
-    presets = [chain for chain in args.chains if chain != PEER]
     options.publish(
         args, table_of(rows) + "\n", args.out / "speed.md", table="bench_speed_runs",
-        command=options.command_line(parser, args), versions=stamps.of_whole_runs(*(load(name) for name in presets)),
+        command=options.command_line(parser, args), versions=stamps.of_pipeline(),
     )  # fmt: skip
