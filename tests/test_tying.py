@@ -110,3 +110,15 @@ def test_the_ground_ties_nothing_where_no_other_pair_shows_it() -> None:
     anchor = next(i for i in (pairs[-1].image_id0, pairs[-1].image_id1) if i != LAST)
     alone = [p for p in pairs[:-1] if anchor not in (p.image_id0, p.image_id1)] + pairs[-1:]
     assert tied_by_ground(alone, known, dict.fromkeys(cameras, CAMERA), thresholds) == {}
+
+
+def test_positions_tell_the_distance_from_each_other_where_the_model_lies_beside_them() -> None:
+    truth = flight()
+    pairs = one_pair_each(truth)
+    given = placed(truth, (0.0, 0.0, 0.0), 2.0)
+    aside = {i: replace(pose, center_m=pose.center_m + np.array([0.0, 40.0, 0.0])) for i, pose in given.items()}
+    pose, anchor = tied(truth, aside, pairs)[LAST]
+    assert np.linalg.norm(pose.center_m - truth[LAST].center_m) < 3.0
+    # Positions of which one alone is wrong tell nothing.
+    assert tied(truth, {**given, LAST: aside[LAST]}, pairs) == {}
+    assert anchor in (pairs[-1].image_id0, pairs[-1].image_id1)

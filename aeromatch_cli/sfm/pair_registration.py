@@ -5,7 +5,8 @@ An image may hang on the oriented block by pairs without keypoints in common wit
 
 A pair tells the attitude of the second image and the direction to it, not the distance: mappers put such images
 anywhere along that direction. The given position tells the distance; blocks that need it: every 2nd and every 3rd image
-of lewis with positions (2 of 16 and 1 of 11 images). Without a position the ground does: what the pair shows of it is
+of lewis with positions (2 of 16 and 1 of 11 images). A weak model may itself lie beside its positions: then they tell
+the distance from each other (every 4th image of seneca). Without a position the ground does: what the pair shows of it is
 about as high as what the block shows beside it. Blocks that need it: every 4th image of seneca and of lewis without
 positions (1 of 7 and 1 of 8).
 """
@@ -54,9 +55,9 @@ def tied_by_pairs(
 ) -> dict[str, tuple[Pose, str]]:
     """Return poses of further images, and the image that each was tied to.
 
-    known: oriented images, in the frame of the given positions. given: image_id -> pose whose position counts.
-    thresholds_px: by image_id, errors of exact matches in stored pixels. The pair with most matches comes first; what
-    it ties is known from then on.
+    known: oriented images, in the frame of the given positions. given: image_id -> pose whose position counts, of known
+    images, too. thresholds_px: by image_id, errors of exact matches in stored pixels. The pair with most matches comes
+    first; what it ties is known from then on.
     """
     poses = dict(known)
     found: dict[str, tuple[Pose, str]] = {}
@@ -67,7 +68,7 @@ def tied_by_pairs(
         if best is None:
             return found
         left = [p for p in left if {p.image_id0, p.image_id1} != {best.image_id0, best.image_id1}]
-        pose = _tied(best, poses[best.image_id0], given[best.image_id1], cameras, thresholds_px)
+        pose = _tied(best, poses[best.image_id0], given, cameras, thresholds_px)
         if pose is not None:
             poses[best.image_id1] = pose
             found[best.image_id1] = pose, best.image_id0
@@ -176,7 +177,11 @@ def _from_known(pair: PairPoints, poses: Mapping[str, Pose]) -> PairPoints:
 
 
 def _tied(
-    pair: PairPoints, known: Pose, given: Pose, cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]
+    pair: PairPoints,
+    known: Pose,
+    given: Mapping[str, Pose],
+    cameras: Mapping[str, Camera],
+    thresholds_px: Mapping[str, float],
 ) -> Pose | None:
     """Pose of the second image, None where its position or the matches contradict it."""
     assert known.world_rotation is not None
@@ -186,10 +191,12 @@ def _tied(
     rotation = view.rotation @ known.world_rotation
     limits_px = {i: _SLACK * thresholds_px[i] for i in ends}
     for direction in _directions(view.model, view.rotation, known.world_rotation):
-        center_m = _along(known, given, direction)
+        center_m = _along(known, given[ends[1]], direction)
+        if center_m is None and ends[0] in given:
+            center_m = _apart(known, given[ends[0]], given[ends[1]], direction)
         if center_m is None:
             continue
-        pose = replace(given, center_m=center_m, world_rotation=rotation, sigma_angle_deg=_SIGMA_DEG)
+        pose = replace(given[ends[1]], center_m=center_m, world_rotation=rotation, sigma_angle_deg=_SIGMA_DEG)
         both = {ends[0]: known, ends[1]: pose}
         if explained_share(pair, both, cameras, limits_px) >= EXPLAINED_SHARE:
             return pose
@@ -219,12 +226,21 @@ def _directions(model: FloatArray, rotation: FloatArray, known: FloatArray) -> t
 
 def _along(known: Pose, given: Pose, direction: FloatArray) -> FloatArray | None:
     """The place on a ray from the known centre that is nearest to the given position, None where that lies beside."""
-    ahead = given.center_m - known.center_m
-    distance_m = float(ahead @ direction)
-    limit_m = _SIGMAS * given.sigma_position_m
-    if distance_m < -limit_m or float(np.linalg.norm(ahead - distance_m * direction)) > limit_m:
+    return _reached(known, given.center_m - known.center_m, given.sigma_position_m, direction)
+
+
+def _apart(known: Pose, given0: Pose, given1: Pose, direction: FloatArray) -> FloatArray | None:
+    """The place on a ray from the known centre as far away as two given positions are apart, None where the way between
+    them has another direction."""
+    sigma_m = float(np.hypot(given0.sigma_position_m, given1.sigma_position_m))
+    return _reached(known, given1.center_m - given0.center_m, sigma_m, direction)
+
+
+def _reached(known: Pose, ahead_m: FloatArray, sigma_m: float, direction: FloatArray) -> FloatArray | None:
+    distance_m, limit_m = float(ahead_m @ direction), _SIGMAS * sigma_m
+    if distance_m < -limit_m or float(np.linalg.norm(ahead_m - distance_m * direction)) > limit_m:
         return None
-    return np.asarray(known.center_m + max(distance_m, _NEAREST * given.sigma_position_m) * direction)
+    return np.asarray(known.center_m + max(distance_m, _NEAREST * sigma_m) * direction)
 
 
 def predicted(block: Block, found: Mapping[str, Pose]) -> dict[str, Pose]:

@@ -200,8 +200,9 @@ def from_models(
     # The mapper's own points are few: it leans on the longest tracks.
     lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
     placed = {i: pose for i, pose in found.items() if i not in beside}
-    loose = {i: pose for i, pose in block.poses.items() if i not in found}
-    tied = tied_by_pairs(evidence.pairs, placed, loose, lenses, evidence.thresholds_px)
+    # Images of groups beside are in frames of their own.
+    counting = {i: pose for i, pose in block.poses.items() if i not in beside}
+    tied = tied_by_pairs(evidence.pairs, placed, counting, lenses, evidence.thresholds_px)
     found |= {i: pose for i, (pose, _) in tied.items()}
     on_ground = _tied_by_ground(evidence, models, found, lenses)
     found |= {i: pose for i, (pose, _) in on_ground.items()}
