@@ -65,7 +65,7 @@ def test_few_or_wrong_matches_tie_nothing() -> None:
     truth = flight()
     *others, last = one_pair_each(truth)
     given = placed(truth, (0.0, 0.0, 0.0), 2.0)
-    few = PairPoints(last.image_id0, last.image_id1, last.points0_px[:20], last.points1_px[:20], last.indices[:20])
+    few = PairPoints(last.image_id0, last.image_id1, last.points0_px[:14], last.points1_px[:14], last.indices[:14])
     assert tied(truth, given, [*others, few]) == {}
     mixed = replace(last, points1_px=np.roll(last.points1_px, 5, axis=0))
     assert tied(truth, given, [*others, mixed]) == {}

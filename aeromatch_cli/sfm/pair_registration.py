@@ -6,9 +6,9 @@ An image may hang on the oriented block by pairs without keypoints in common wit
 A pair tells the attitude of the second image and the direction to it, not the distance: mappers put such images
 anywhere along that direction. The given position tells the distance; blocks that need it: every 2nd and every 3rd image
 of lewis with positions (2 of 16 and 1 of 11 images). A weak model may itself lie beside its positions: then they tell
-the distance from each other (every 4th image of seneca). Without a position the ground does: what the pair shows of it is
-about as high as what the block shows beside it. Blocks that need it: every 4th image of seneca and of lewis without
-positions (1 of 7 and 1 of 8).
+the distance from each other (every 4th image of seneca). Without a position the ground does: what the pair shows of it
+is about as high as what the block shows beside it. Blocks that need it: every 4th image of seneca, lewis and ochota
+without positions (1 of 7, 1 of 8, 3 of 10).
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.geometry.two_view import Sampling, TwoView, estimate, undistorted
 from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, PairPoints, explained_share, triangulated
 
-# Fewer matches do not tell an attitude.
-_LEAST_MATCHES = 30
+# Fewer matches do not tell an attitude. Of a pair that is verified there are so many; every 4th image of ochota needs 20
+# and 29.
+_LEAST_MATCHES = 15
 # A position lies beside the direction that the pair tells by at most so many standard deviations.
 _SIGMAS = 3.0
 # Where positions are as near to each other as they are exact, the images are this many standard deviations apart.
