@@ -251,7 +251,7 @@ def test_views_of_distant_ground_are_bounded(
 @pytest.mark.slow
 def test_distant_ground_does_not_tell_how_views_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Distant ground full of blobs beside near ground with fine ones: that goes back to full size all the same."""
-    monkeypatch.setattr("aeromatch_cli.strategies.extractors.reduction._LEAST_PX", 1000)
+    monkeypatch.setattr("aeromatch_cli.strategies.extractors.reduction.LEAST_PX", 1000)
     rng = np.random.default_rng(0)
     gray = np.full((PINHOLE.height_px, PINHOLE.width_px), 128, np.uint8)
     gray[:350] = cv2.resize(rng.integers(0, 256, (50, 143), dtype=np.uint8), (1000, 350), interpolation=cv2.INTER_CUBIC)

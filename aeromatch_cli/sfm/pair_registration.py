@@ -24,8 +24,8 @@ from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.geometry.two_view import Sampling, TwoView, estimate, undistorted
 from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, PairPoints, explained_share, triangulated
 
-# Fewer matches do not tell an attitude. Of a pair that is verified there are so many; every 4th image of ochota needs 20
-# and 29.
+# Fewer matches do not tell an attitude. Of a pair that is verified there are so many; every 4th image of ochota needs
+# 20 and 29.
 _LEAST_MATCHES = 15
 # A position lies beside the direction that the pair tells by at most so many standard deviations.
 _SIGMAS = 3.0
