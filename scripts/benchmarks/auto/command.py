@@ -92,7 +92,12 @@ def _real(arguments: Sequence[str]) -> None:
     parser = options.make_parser("auto real", __doc__)
     add = parser.add_argument
     add("--data", type=Path, required=True, metavar="DIR", help="folder of blocks")
-    add("--blocks", type=options.names, default="ochota,lewis,seneca,caliterra,sheffield,brighton", help="names, comma-separated")
+    add(
+        "--blocks",
+        type=options.names,
+        default="ochota,lewis,seneca,caliterra,sheffield,brighton",
+        help="names, comma-separated",
+    )
     add("--thin", type=options.numbers, default="4", help="keep every k-th image; several k comma-separated")
     add("--given", type=options.names, default="positions,nothing", help=f"of {', '.join(real.GIVEN)}")
     add("--presets", type=split_methods, default=JUDGED, help="comma-separated")
