@@ -20,7 +20,7 @@ from aeromatch_cli.nets.files import SHIPPED_FOLDER, shipped_weights
 NOT_MADE_YET = {
     "bench_auto", "bench_auto_strategies", "bench_auto_real", "bench_peers_rendered",
     "bench_peers_real", "bench_calibration", "bench_orientation_real", "bench_orientation_rendered", "bench_growth",
-    "bench_speed_runs", "bench_robustness",
+    "bench_speed_runs",
 }  # fmt: skip
 PRESENT = stamps.present_versions()
 RESULTS = sorted(pages.FOLDER.glob("*.md"))
