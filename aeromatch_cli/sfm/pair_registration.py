@@ -14,7 +14,7 @@ without positions (1 of 7, 1 of 8, 3 of 10).
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -60,19 +60,11 @@ def tied_by_pairs(
     images, too. thresholds_px: by image_id, errors of exact matches in stored pixels. The pair with most matches comes
     first; what it ties is known from then on.
     """
-    poses = dict(known)
-    found: dict[str, tuple[Pose, str]] = {}
-    left = [p for p in pairs if len(p.indices) >= _LEAST_MATCHES and not {p.image_id0, p.image_id1} <= poses.keys()]
-    left.sort(key=lambda p: -len(p.indices))
-    while True:
-        best = _best_tie(left, poses, given)
-        if best is None:
-            return found
-        left = [p for p in left if {p.image_id0, p.image_id1} != {best.image_id0, best.image_id1}]
-        pose = _tied(best, poses[best.image_id0], given, cameras, thresholds_px)
-        if pose is not None:
-            poses[best.image_id1] = pose
-            found[best.image_id1] = pose, best.image_id0
+
+    def placed(pair: PairPoints, poses: Mapping[str, Pose]) -> Pose | None:
+        return _tied(pair, poses[pair.image_id0], given, cameras, thresholds_px)
+
+    return _one_by_one(pairs, known, given.keys(), placed)
 
 
 def tied_by_ground(
@@ -85,23 +77,40 @@ def tied_by_ground(
 
     known: oriented images of one model, z upwards. Arguments otherwise as of `tied_by_pairs`.
     """
+    inside = [p for p in pairs if {p.image_id0, p.image_id1} <= known.keys()]
+
+    def placed(pair: PairPoints, poses: Mapping[str, Pose]) -> Pose | None:
+        pose = _on_ground(pair, inside, poses, cameras, thresholds_px)
+        if pose is not None:
+            inside.append(pair)
+        return pose
+
+    return _one_by_one(pairs, known, {i for p in pairs for i in (p.image_id0, p.image_id1)}, placed)
+
+
+def _one_by_one(
+    pairs: Sequence[PairPoints],
+    known: Mapping[str, Pose],
+    wanted: Collection[str],
+    placed: Callable[[PairPoints, Mapping[str, Pose]], Pose | None],
+) -> dict[str, tuple[Pose, str]]:
+    """Return poses of the images wanted that pairs tie, one after the other, and the image that each was tied to.
+
+    placed: the pose of the second image of a pair whose first one is known, None where it cannot be tied.
+    """
     poses = dict(known)
     found: dict[str, tuple[Pose, str]] = {}
     left = [p for p in pairs if len(p.indices) >= _LEAST_MATCHES and not {p.image_id0, p.image_id1} <= poses.keys()]
     left.sort(key=lambda p: -len(p.indices))
-    inside = [p for p in pairs if {p.image_id0, p.image_id1} <= poses.keys()]
     while True:
-        anywhere = {i: poses[i] for p in left for i in (p.image_id0, p.image_id1) if i in poses}
-        wanted = {i: Pose(np.zeros(3), None, 0.0, 0.0) for p in left for i in (p.image_id0, p.image_id1)}
-        best = _best_tie(left, anywhere, {i: pose for i, pose in wanted.items() if i not in poses})
+        best = _best_tie(left, poses, wanted)
         if best is None:
             return found
         left = [p for p in left if {p.image_id0, p.image_id1} != {best.image_id0, best.image_id1}]
-        pose = _on_ground(best, inside, poses, cameras, thresholds_px)
+        pose = placed(best, poses)
         if pose is not None:
             poses[best.image_id1] = pose
             found[best.image_id1] = pose, best.image_id0
-            inside.append(best)
 
 
 def _on_ground(
@@ -154,9 +163,9 @@ def _by_height(unit_m: FloatArray, points_m: FloatArray, center_m: FloatArray) -
     return distance_m, float(np.median(np.abs(distances_m / distance_m - 1.0))) if distance_m > 0.0 else np.inf
 
 
-def _best_tie(pairs: Sequence[PairPoints], poses: Mapping[str, Pose], given: Mapping[str, Pose]) -> PairPoints | None:
-    """Return the first pair of a known and another image, pairs with most matches first; the last by name of several
-    alike."""
+def _best_tie(pairs: Sequence[PairPoints], poses: Mapping[str, Pose], wanted: Collection[str]) -> PairPoints | None:
+    """Return the first pair of a known image and one that is wanted, pairs with most matches first; the last by name
+    of several alike."""
     best: PairPoints | None = None
     for pair in pairs:
         if best is not None and len(pair.indices) < len(best.indices):
@@ -165,7 +174,7 @@ def _best_tie(pairs: Sequence[PairPoints], poses: Mapping[str, Pose], given: Map
             continue
         tie = _from_known(pair, poses)
         later = best is None or (tie.image_id0, tie.image_id1) > (best.image_id0, best.image_id1)
-        if tie.image_id1 in given and later:
+        if tie.image_id1 in wanted and later:
             best = tie
     return best
 
