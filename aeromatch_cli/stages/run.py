@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from aeromatch_cli import graph, report
@@ -107,7 +107,8 @@ def execute(
                 Executor(run.executor, run.jobs, progress, run.scheduler) as executor,
                 _index(Workspace(root.absolute()), command, part) as index,
             ):
-                result = _repairing(command, settings, executor, index, part, deadline, overwrite, Said(say))
+                asked = _Asked(command, settings, executor, index, part, deadline, overwrite, Said(say))
+                result = _repairing(asked)
                 if inputs and not result.failures and not (deadline and deadline.left_out):
                     up_to_date.remember(Workspace(root), index, inputs, result.reports)
             return named(result, root)
@@ -165,29 +166,35 @@ def _index(workspace: Workspace, command: str, part: Shard | None) -> Iterator[I
         yield index
 
 
-def _repairing(
-    command: str,
-    settings: Settings,
-    executor: Executor,
-    index: Index,
-    part: Shard | None,
-    deadline: Deadline | None,
-    overwrite: bool,
-    said: Said,
-) -> Result:
-    """Repeats the command until it meets no damaged file; each one is deleted, so that it is made again."""
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """One command with what it is run with. part: of a sharded run. overwrite: results are made anew though they are up
+    to date."""
+
+    command: str
+    settings: Settings
+    executor: Executor
+    index: Index
+    part: Shard | None
+    deadline: Deadline | None
+    overwrite: bool
+    said: Said
+
+
+def _repairing(asked: _Asked) -> Result:
+    """Repeat the command until it meets no damaged file; each one is deleted, so that it is made again."""
     repaired: set[str] = set()
     while True:
         try:
-            return _attempt(command, settings, executor, index, part, deadline, overwrite, said)
+            return _attempt(asked)
         except BrokenFileError as error:
-            if command == "check" or error.path in repaired:
+            if asked.command == "check" or error.path in repaired:
                 raise
-            if not _makes(command, Workspace(Path(settings.workspace)), Path(error.path)):
+            if not _makes(asked.command, Workspace(Path(asked.settings.workspace)), Path(error.path)):
                 words = f"{error.path} is damaged ({error.reason}): run `aeromatch run`, which makes it again"
                 raise WorkspaceError(words) from None
             repaired.add(error.path)
-            overwrite = False  # what this command has done already is up to date
+            asked = replace(asked, overwrite=False)  # what this command has done already is up to date
             log.warning("warning: %s was damaged (%s): it is made again", error.path, error.reason)
             with translated_os_errors(Path(error.path)):
                 Path(error.path).unlink(missing_ok=True)
@@ -199,16 +206,8 @@ def _makes(command: str, workspace: Workspace, path: Path) -> bool:
     return graph.makes(command, PurePosixPath(below.as_posix()))
 
 
-def _attempt(
-    command: str,
-    settings: Settings,
-    executor: Executor,
-    index: Index,
-    part: Shard | None,
-    deadline: Deadline | None,
-    overwrite: bool,
-    said: Said,
-) -> Result:
+def _attempt(asked: _Asked) -> Result:
+    command, settings, deadline, said = asked.command, asked.settings, asked.deadline, asked.said
     dry = command == "check"
     workspace = Workspace(Path(settings.workspace))
     if _there(settings) and not dry:
@@ -218,16 +217,17 @@ def _attempt(
         said(f"changed          {words}")
     exports = command in _EXPORTING
     context, *reports = pairs.prepare(
-        settings, executor, said, index=index, shard=part, overwrite=overwrite, dry=dry, exports=exports
-    )
-    if command == "check":
+        settings, asked.executor, said,
+        index=asked.index, shard=asked.part, overwrite=asked.overwrite, dry=dry, exports=exports,
+    )  # fmt: skip
+    if dry:
         return _check(context, reports[0], reports[-1], said)
     if deadline is not None:
         deadline.left_out.clear()  # of an attempt that met a damaged file
         if smaller := fitting(context, deadline):
             said(f"within           {deadline.text}: left out for that: {'; '.join(deadline.left_out)}")
-            context, *reports = pairs.prepare(smaller, executor, index=index, exports=exports)
-            context = context.with_scope(overwrite=overwrite)
+            context, *reports = pairs.prepare(smaller, asked.executor, index=asked.index, exports=exports)
+            context = context.with_scope(overwrite=asked.overwrite)
     if command == "run":
         reports += _run_all(context, reports[-1], deadline)
     elif context.settings.cascade and command in _AFTER_CASCADE:
