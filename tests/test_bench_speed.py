@@ -14,8 +14,9 @@ import pytest
 from benchmarks import speed
 
 
-def row(chain: str, seconds: float, processor: float, **stages: float) -> dict[str, Any]:
-    head = {"scene": "easy", "megapixels": 3, "images": 8, "chain": chain, "keypoints": 4000, "jobs": 2, "seed": 1}
+def row(chain: str, seconds: float, processor: float, repeat: int = 0, **stages: float) -> dict[str, Any]:
+    head = {"scene": "easy", "megapixels": 3, "images": 8, "chain": chain, "repeat": repeat}
+    head |= {"keypoints": 4000, "jobs": 2, "seed": 1}
     made = {"seconds": seconds, "processor_seconds": processor, "peak_mb": 800.0, "oriented": 7}
     return {**head, **made, "stages": stages}
 
@@ -52,10 +53,20 @@ def test_ratios_are_of_processor_seconds_and_shares_of_wall_seconds() -> None:
     assert dict(zip(lines[0], lines[4], strict=True))["rest"] == "-"
 
 
+def test_repeated_runs_are_medians_with_their_ranges() -> None:
+    rows = [row("baseline", 50.0, processor, repeat) for repeat, processor in enumerate((80.0, 100.0))]
+    rows += [row("auto", seconds, 2.0 * seconds, repeat) for repeat, seconds in enumerate((60.0, 66.0))]
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in speed.table_of(rows).splitlines()]
+    auto = dict(zip(lines[0], lines[3], strict=True))
+    assert len(lines) == 4
+    assert (auto["wall, s"], auto["processor, s"]) == ("63", "126 (120 to 132)")
+    assert auto["x `baseline`"] == "1.40 x (1.20 to 1.65)"
+
+
 def test_rows_that_are_known_are_not_made_again(tmp_path: Path) -> None:
     known = [row(chain, 1.0, 1.0) for chain in ("baseline", "pycolmap")]
     asked = {"scenes": ["easy"], "megapixels": [3], "images": [8], "chains": ["baseline", "pycolmap"], "seed": 1}
-    args = argparse.Namespace(**asked, keypoints=4000, jobs=2, out=tmp_path / "nowhere", keep=False)
+    args = argparse.Namespace(**asked, keypoints=4000, jobs=2, repeats=1, out=tmp_path / "nowhere", keep=False)
     assert list(speed.rows_of(args, known)) == known
     assert not args.out.exists()
 

@@ -13,6 +13,8 @@ work on the machine hardly changes; ratios are theirs. Peak: the largest sum of 
 are those of wall seconds: pycolmap's matching includes verification, its adjustment is the mapping; the rest is start,
 pairs, consistency, export and report.
 
+Every run is made --repeats times; figures are medians, ranges in brackets lie between the least and the most.
+
 Writes OUT/speed.json and OUT/speed.md. Rows that OUT has are not made again.
 """
 
@@ -20,13 +22,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from aeromatch_cli.files import write_json
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap, resized
@@ -34,7 +39,20 @@ from benchmarks import options, stamps
 from benchmarks.processes import children_seconds, run_watched
 from benchmarks.scenes import render_once
 from benchmarks.stamps import REPOSITORY
-from benchmarks.tables import Row, code, factor, markdown, number, percent, ratio, write_rows
+from benchmarks.tables import (
+    Row,
+    code,
+    grouped,
+    markdown,
+    median,
+    number,
+    percent,
+    ranged,
+    ratio,
+    total,
+    values,
+    write_rows,
+)
 
 SCENES = {"easy": ("suburb", "nadir"), "hard": ("city", "two-flights")}
 PEER = "pycolmap"
@@ -157,8 +175,8 @@ def rows_of(args: argparse.Namespace, known: Sequence[Row]) -> Iterator[Row]:
     counts = args.images * len(args.megapixels) if len(args.images) == 1 else args.images
     for scene in args.scenes:
         for megapixels, images in zip(args.megapixels, counts, strict=True):
-            for chain in args.chains:
-                head = {"scene": scene, "megapixels": megapixels, "images": images, "chain": chain}
+            for chain, repeat in product(args.chains, range(args.repeats)):
+                head = {"scene": scene, "megapixels": megapixels, "images": images, "chain": chain, "repeat": repeat}
                 head |= {"keypoints": args.keypoints, "jobs": args.jobs, "seed": args.seed}
                 found = next((row for row in known if head.items() <= row.items()), None)
                 if found is None:
@@ -170,24 +188,40 @@ def rows_of(args: argparse.Namespace, known: Sequence[Row]) -> Iterator[Row]:
 
 
 def table_of(rows: Sequence[Row]) -> str:
-    """A line per row; ratios of processor seconds to `baseline` and to pycolmap on the same block."""
+    """A line per block and chain; ratios of processor seconds to `baseline` and to pycolmap on the same block."""
     heads = ("scene", "megapixels", "chain", "oriented", "wall, s", "processor, s", "x `baseline`", "x pycolmap")
+    used = {key: values(own, "processor_seconds") for key, own in grouped(rows, "scene", "megapixels", "chain")}
     lines = []
-    for row in rows:
-        same = {other["chain"]: other for other in rows if all(other[k] == row[k] for k in ("scene", "megapixels"))}
-        beside = [
-            factor(ratio(row["processor_seconds"], same[name]["processor_seconds"])) if name in same else "-"
-            for name in ("baseline", PEER)
+    for (scene, megapixels, chain), own in grouped(rows, "scene", "megapixels", "chain"):
+        ours = used[scene, megapixels, chain]
+        beside = [_times(ours, used.get((scene, megapixels, other), [])) for other in ("baseline", PEER)]
+        shares = [
+            ratio(math.fsum(row["stages"].get(stage, 0.0) for row in own), total(own, "seconds")) for stage in STAGES
         ]
-        shares = [row["stages"].get(stage, 0.0) / row["seconds"] for stage in STAGES]
         cells = [percent(share) if share else "-" for share in [*shares, 1.0 - sum(shares)]]
-        seconds = number(row["seconds"]), number(row["processor_seconds"])
-        oriented = f"{row['oriented']} of {row['images']}"
+        oriented = f"{min(row['oriented'] for row in own)} of {own[0]['images']}"
         lines.append(
-            (row["scene"], row["megapixels"], code(row["chain"]), oriented, *seconds, *beside,
-             number(row["peak_mb"]), *cells)
+            (scene, megapixels, code(chain), oriented, number(median(own, "seconds")), _span(ours, 0), *beside,
+             number(median(own, "peak_mb")), *cells)
         )  # fmt: skip
     return markdown((*heads, "peak, MB", *STAGES, "rest"), lines)
+
+
+def _times(ours: Sequence[float], theirs: Sequence[float]) -> str:
+    """Ratio of medians; its range is that of any of ours to any of theirs."""
+    ratios = [a / b for a, b in product(ours, theirs)]
+    if not ratios or ours is theirs:
+        return "-"
+    return ranged(float(np.median(ours) / np.median(theirs)), _range(ratios), 2, " x")
+
+
+def _span(seconds: Sequence[float], digits: int) -> str:
+    return ranged(float(np.median(seconds)), _range(seconds), digits)
+
+
+def _range(figures: Sequence[float]) -> tuple[float, float]:
+    """The least and the most; NaN of a single one."""
+    return (min(figures), max(figures)) if len(figures) > 1 else (math.nan, math.nan)
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -198,11 +232,12 @@ def main(arguments: Sequence[str]) -> None:
     add("--scenes", type=options.names, default=",".join(SCENES), help="comma-separated")
     add("--chains", type=options.names, default=",".join(CHAINS), help="presets and pycolmap, comma-separated")
     add("--keypoints", type=options.positive, default=8000, help="SIFT keypoints per image, of all chains")
+    add("--repeats", type=options.positive, default=2, help="runs of each chain")
     add("--keep", action="store_true", help="leave the workspaces in OUT")
     add("--seed", type=int, default=64)
     add("--jobs", type=options.positive, default=2)
     options.add_output(parser)
-    args = options.parse(parser, arguments, {"images": "6", "megapixels": "1", "keypoints": 2000})
+    args = options.parse(parser, arguments, {"images": "6", "megapixels": "1", "keypoints": 2000, "repeats": 1})
     if len(args.images) not in (1, len(args.megapixels)):
         parser.error("--images: give one number, or one for each of --megapixels")
     args.out.mkdir(parents=True, exist_ok=True)
