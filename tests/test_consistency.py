@@ -251,6 +251,11 @@ def test_improbable_matches_of_a_pair_that_no_block_holds_are_dropped(truth: Tru
     assert found.masks[0][:WRONG].mean() >= 0.7
     assert found.masks[0][WRONG:].mean() < 0.15
     assert (found.masks[0] == held.masks[0]).mean() > 0.95
+    surer = replace(limits, min_expected_right=0.99)
+    fewer = contradicting(nothing, cameras(truth), keypoints.__getitem__, [pair], surer)
+    assert fewer.expected_right is not None
+    assert fewer.masks[0].sum() > found.masks[0].sum()
+    assert fewer.expected_right > found.expected_right
     assert not contradicting(nothing, cameras(truth), keypoints.__getitem__, [pair], LIMITS).masks[0].any()
     unknown = replace(pair, alone=None)
     assert not contradicting(nothing, cameras(truth), keypoints.__getitem__, [unknown], limits).masks[0].any()

@@ -181,6 +181,7 @@ def test_tables_depend_on_what_they_measure() -> None:
     assert stamps.of_pipeline() == {"pipeline": PRESENT["pipeline"]}
     chain = stamps.of_chain("auto", "baseline[match.ratio=0.7]")
     assert {"stage.orient", "stage.adjust", "stage.consistency", "cascade.learned", "weights.detector"} < chain.keys()
+    assert chain["preset.auto"] == PRESENT["preset.auto"] != chain["preset.baseline"]
     assert not [key for key in chain if key.startswith("export.")]
     assert stamps.of_chain("auto", exported=True).keys() - chain.keys() == {"export.colmap"}
     matching = stamps.of_matching(load("oblique"))

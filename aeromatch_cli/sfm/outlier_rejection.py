@@ -17,7 +17,14 @@ from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, Int
 from aeromatch_cli.geometry.cameras import focal_px, world_rays
 from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.geometry.epipolar import ray_depths
-from aeromatch_cli.sfm.probability import MatchEvidence, off_neighbours_px, probabilities, probable_enough, usual_off_px
+from aeromatch_cli.sfm.probability import (
+    MatchEvidence,
+    least_probability,
+    off_neighbours_px,
+    probabilities,
+    probable_enough,
+    usual_off_px,
+)
 
 # Rays that meet at a smaller angle do not tell whether they meet in front of the cameras.
 _LEAST_ANGLE_DEG = 0.5
@@ -40,14 +47,20 @@ class Limits:
     counts: an image that the block holds less exactly than others has larger distances in all of its matches. third_px:
     distance of a third image's keypoint from the place of the point there; where the rays leave that place open by more
     than a pixel, it grows with that. min_probability: a match that is less likely to be right counts as contradicting
-    unless images would fall apart by that; 0 for never. min_matches: a pair with fewer ties nothing.
+    unless images would fall apart by that, and so are the least likely ones where a smaller share than
+    min_expected_right of the others would be right; 0 for never. min_matches: a pair with fewer ties nothing.
     """
 
     epipolar_px: float
     medians: float
     third_px: float
     min_probability: float = 0.0
+    min_expected_right: float = 0.0
     min_matches: int = 15
+
+    @property
+    def by_probability(self) -> bool:
+        return max(self.min_probability, self.min_expected_right) > 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,17 +107,18 @@ def contradicting(
     settled = Settled.of(block, cameras, keypoints_px, pairs, limits)
     masks: list[BoolArray | None] = settled.masks
     left: list[FloatArray] = [np.zeros(0)]
-    if limits.min_probability > 0.0:
+    if limits.by_probability:
         masks, known = settled.with_lone_pairs(cameras, keypoints_px, limits)
     found = [
         np.zeros(len(pair.indices), dtype=bool) if mask is None else mask.copy()
         for pair, mask in zip(pairs, masks, strict=True)
     ]
-    if limits.min_probability > 0.0:
+    if limits.by_probability:
         usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
         likely = [None if evidence is None else probabilities(evidence, usual_px) for evidence in known]
         ends = [(pair.image_id0, pair.image_id1) for pair in pairs]
-        stays = probable_enough(ends, likely, limits.min_probability, limits.min_matches)
+        least = least_probability(likely, limits.min_probability, limits.min_expected_right)
+        stays = probable_enough(ends, likely, least, limits.min_matches)
         for mask, p, keep in zip(found, likely, stays, strict=True):
             if p is not None and keep is not None:
                 mask[~mask] = ~keep

@@ -27,6 +27,7 @@ from aeromatch_cli.stages.filter import connection
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.state import BlockState, Judged
 from aeromatch_cli.store.matches import FinalEntries
+from aeromatch_cli.strategies.consistencies import BlockConsistency
 
 VERSION = 7
 
@@ -62,10 +63,7 @@ def run(context: Context) -> StageReport:
         ]
         keypoints_px = contents_of(context, adjusted).keypoints_px
         pairs = [_matched(context, adjusted, keypoints_px, pair.image_id0, entry) for pair, entry in entries]
-        limits = Limits(
-            recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches
-        )
-        found = contradicting(adjusted, cameras, keypoints_px, pairs, limits)
+        found = contradicting(adjusted, cameras, keypoints_px, pairs, limits_of(recipe))
     dropped: Dropped = {
         (pair.image_id0, pair.image_id1): (entry.fingerprint, np.flatnonzero(mask).astype(np.int32))
         for (pair, entry), mask in zip(entries, found.masks, strict=True)
@@ -101,7 +99,19 @@ def run(context: Context) -> StageReport:
 def _judges_pairs(context: Context) -> bool:
     """Whether pairs are judged that no adjusted block holds."""
     recipe = context.settings.rejection
-    return recipe is not None and recipe.min_probability > 0.0
+    return recipe is not None and recipe.judges_probability
+
+
+def limits_of(recipe: BlockConsistency) -> Limits:
+    """Return what the settings say, for `contradicting`."""
+    return Limits(
+        recipe.epipolar_px,
+        recipe.medians,
+        recipe.third_image_px,
+        recipe.min_probability,
+        recipe.min_expected_right,
+        recipe.min_matches,
+    )
 
 
 def _matched(

@@ -40,12 +40,25 @@ class BlockConsistency(Strategy):
         "epipolar line, third images, neighbouring matches, and how loose the whole pair is; pairs without which "
         "images would fall apart keep their best 30. 0 = none. Larger: fewer matches, fewer of them wrong.",
     )
+    min_expected_right: float = Field(
+        0.0,
+        ge=0.0,
+        lt=1.0,
+        description="Where a smaller share of the matches left in the block is expected to be right, the least "
+        "probable ones are dropped as well, until this share is reached. 0 = none. Larger: fewer matches, fewer of "
+        "them wrong.",
+    )
     min_matches: int = Field(
         15,
         ge=1,
         description="A pair that has lost matches and keeps fewer than this is rejected. Larger: fewer pairs, fewer of "
         "them wrong.",
     )
+
+    @property
+    def judges_probability(self) -> bool:
+        """Whether it is asked how likely matches are to be right."""
+        return self.min_probability > 0.0 or self.min_expected_right > 0.0
 
 
 class NoConsistency(Strategy):

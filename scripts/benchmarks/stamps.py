@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import subprocess
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -9,7 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.config import FAMILIES, Settings, load, parse_method
+from aeromatch_cli.config import FAMILIES, Settings, load, parse_method, preset_names
+from aeromatch_cli.config.load import differences_of_preset
 from aeromatch_cli.lab.strategies import ARMS
 from aeromatch_cli.nets.files import SHIPPED_FOLDER, sha256_of_file
 from aeromatch_cli.nets.precision import has_bfloat16
@@ -29,7 +32,7 @@ _ORIENTATION: Versions = {
     "stage.adjust": adjust.VERSION,
     "stage.consistency": consistency.VERSION,
 }
-_DIGITS = 12  # of a SHA-256 that tell weights apart
+_DIGITS = 12  # of a SHA-256 that tell weights and presets apart
 _SOME = ("sheffield", "caliterra", "brighton")
 _MOST = ("sheffield", "caliterra", "seneca", "brighton")
 # Real blocks whose pictures a network has seen in training, as its card says (nets/trained/*.md).
@@ -122,8 +125,15 @@ def of_chain(*methods: str, exported: bool = False) -> dict[str, Version]:
     """Versions of all that `aeromatch run` rests on with presets, PRESET or PRESET[key=value,...]. exported: whether
     the table shows what others make of the export."""
     every = [load(*parse_method(method)) for method in methods]
+    presets = of_presets(*(parse_method(method)[0] for method in methods))
     families = [family for family in FAMILIES if exported or family != "export"]
-    return of_settings(*every, families=families) | (_ORIENTATION if every else {})
+    return presets | of_settings(*every, families=families) | (_ORIENTATION if every else {})
+
+
+def of_presets(*names: str) -> dict[str, Version]:
+    """What presets set that is not the default, as digests."""
+    every = {name: json.dumps(differences_of_preset(name)[1], sort_keys=True) for name in names}
+    return {f"preset.{name}": hashlib.sha256(text.encode()).hexdigest()[:_DIGITS] for name, text in every.items()}
 
 
 def of_strategies(family: str, *strategies: Strategy) -> dict[str, Version]:
@@ -146,7 +156,14 @@ def present_versions() -> dict[str, Version]:
     tables = [*FAMILIES.items(), *ARMS.items()]
     strategies = {f"{family}.{name}": one.version for family, table in tables for name, one in table.items()}
     networks = of_networks(*(path.stem for path in SHIPPED_FOLDER.glob("*.safetensors")))
-    return {"pipeline": PIPELINE_VERSION, "filter.chain": CHAIN_VERSION, **_ORIENTATION, **strategies, **networks}
+    return {
+        "pipeline": PIPELINE_VERSION,
+        "filter.chain": CHAIN_VERSION,
+        **_ORIENTATION,
+        **of_presets(*preset_names()),
+        **strategies,
+        **networks,
+    }
 
 
 def changed(stamp: Stamp, present: Versions) -> Iterator[str]:

@@ -13,8 +13,9 @@ from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.sfm.block_figures import block_figures, residual_figures, residuals_of
 from aeromatch_cli.sfm.control import control_figures
 from aeromatch_cli.sfm.mapping import Observed
-from aeromatch_cli.sfm.outlier_rejection import Contradictions, Limits, MatchedKeypoints, contradicting
+from aeromatch_cli.sfm.outlier_rejection import Contradictions, MatchedKeypoints, contradicting
 from aeromatch_cli.sfm.quality.finding import QualityInput
+from aeromatch_cli.stages.consistency import limits_of
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 
@@ -53,12 +54,8 @@ def of_adjusted(
 
 def _contradictions(contents: ExportContents, adjusted: AdjustedBlock, cameras: Mapping[str, Camera]) -> Contradictions:
     """Of the stage `consistency` as it is set by default."""
-    recipe = BlockConsistency()
     pairs = [
         MatchedKeypoints(p.pair.image_id0, p.pair.image_id1, p.verified, np.zeros(len(p.verified)))
         for p in contents.pairs
     ]
-    limits = Limits(
-        recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches
-    )
-    return contradicting(adjusted, cameras, contents.keypoints_px, pairs, limits)
+    return contradicting(adjusted, cameras, contents.keypoints_px, pairs, limits_of(BlockConsistency()))
