@@ -39,7 +39,10 @@ from benchmarks.processes import limit_threads
 from benchmarks.tables import Row, write_rows
 
 METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
-STRATEGIES = "filter=epipolar+graph,filter=clustered-ransac+epipolar,match=lightglue,enhance=shadow,simulate=neighbours"
+STRATEGIES = (
+    "filter=epipolar+graph,filter=clustered-ransac+epipolar,auto[filter=colour+epipolar,extract.colours=true],"
+    "match=lightglue,enhance=shadow,simulate=neighbours"
+)
 
 
 def _rendered(section: str, arguments: Sequence[str]) -> None:
@@ -98,7 +101,7 @@ def _real(arguments: Sequence[str]) -> None:
         default="ochota,lewis,seneca,caliterra,sheffield,brighton",
         help="names, comma-separated",
     )
-    add("--thin", type=options.numbers, default="4", help="keep every k-th image; several k comma-separated")
+    add("--thin", type=options.numbers, default="3,4", help="keep every k-th image; several k comma-separated")
     add("--given", type=options.names, default="positions,nothing", help=f"of {', '.join(real.GIVEN)}")
     add("--presets", type=split_methods, default=JUDGED, help="comma-separated")
     add("--keypoints", type=options.positive, default=4000, help="SIFT descriptors per image")
