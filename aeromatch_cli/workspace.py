@@ -61,6 +61,10 @@ class Workspace:
         return self.root / "config.yaml"
 
     @property
+    def asked(self) -> Path:
+        return self.root / "asked.yaml"
+
+    @property
     def block(self) -> Path:
         return self.root / "block.json"
 

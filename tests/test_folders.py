@@ -74,6 +74,16 @@ def test_a_descending_terrain_or_a_second_level_is_not_on_the_ground() -> None:
     assert ground_shots(dict(list(facts.items())[:5])) == {}
 
 
+def test_the_lowest_of_images_at_many_heights_is_not_on_the_ground() -> None:
+    """An oblique flight (lewis, every 4th image): 16.8 m below the next one, which are 30.5 m apart themselves."""
+    heights_m = (283.9, 300.7, 301.9, 308.9, 310.9, 320.2, 322.1, 331.2)
+    facts = dict(zip((f"{row}.jpg" for row in range(8)), flight(relative=False).values(), strict=False))
+    at = {name: replace(fact, altitude_m=z_m) for (name, fact), z_m in zip(facts.items(), heights_m, strict=True)}
+    assert ground_shots(at) == {}
+    low = {name: replace(fact, altitude_m=283.9 if row else 150.0) for row, (name, fact) in enumerate(facts.items())}
+    assert list(ground_shots(low)) == ["0.jpg"]
+
+
 @pytest.mark.parametrize(
     ("tag", "panel"),
     [

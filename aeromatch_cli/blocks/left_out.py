@@ -107,7 +107,10 @@ def _standing(facts: Mapping[str, ExifFacts]) -> list[str]:
     low = [name for name, apart_m in off_m.items() if apart_m <= _LEVEL_M]
     if not low or len(low) > _SHARE * len(heights_m):
         return []
-    if min(apart_m for apart_m in off_m.values() if not apart_m <= _LEVEL_M) < _GAP_M:
+    others_m = [apart_m for apart_m in off_m.values() if not apart_m <= _LEVEL_M]
+    # Without heights above take-off nothing says where the ground is, and one of images at many heights is the lowest.
+    spread_m = 0.0 if above_takeoff else max(others_m) - min(others_m)
+    if min(others_m) < max(_GAP_M, spread_m):
         return []
     if above_takeoff or _at_one_place([facts[name] for name in low]):
         return low

@@ -240,12 +240,16 @@ def _check_control(given: Mapping[str, Any], block: BlockSettings) -> None:
 
 
 def _recipe(config: str | None, command: str, workspace: Path | None) -> str:
-    """What a command follows that names no preset: the workspace's own settings for single stages, else `auto`."""
-    if config is not None:
-        return config
-    from aeromatch_cli.config import Settings
+    """What a command follows that names no preset: the workspace's own settings for single stages, else `auto`.
 
-    own = Path(workspace or Settings.model_fields["workspace"].default) / "config.yaml"
+    A whole run of a workspace follows the settings that were asked for where `--within` has reduced them."""
+    from aeromatch_cli.config import Settings
+    from aeromatch_cli.workspace import Workspace
+
+    if config is not None:
+        asked = Workspace(Path(config)).asked
+        return str(asked) if command in _WHOLE and asked.is_file() else config
+    own = Workspace(Path(workspace or Settings.model_fields["workspace"].default)).config
     return str(own) if command not in _WHOLE and own.is_file() else DEFAULT_PRESET
 
 

@@ -18,6 +18,11 @@ without Python objects; their zip comment is `CRC-32 ` and the checksum (8 hex d
 
 The resolved configuration, every default included. `aeromatch run WORK/config.yaml` repeats the run.
 
+### asked.yaml
+
+Only after `run --within` has reduced settings or left steps out: the settings as they were asked for.
+`aeromatch run WORK` follows them and makes the rest.
+
 ### block.json
 
 - `format_version`: 1.

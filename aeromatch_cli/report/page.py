@@ -258,7 +258,8 @@ def _gravest_first(*found: Iterable[Notice]) -> list[Notice]:
 def _input_notices(block: PairsResult | None) -> list[Notice]:
     if block is None:
         return []
-    left = [Notice("warn", "Left out to end in time", words) for words in block.left_out]
+    text = "`aeromatch run` without --within makes the rest."
+    left = [Notice("warn", "Reduced to end in time", text, tuple(block.left_out))] if block.left_out else []
     return [*left, *(Notice("warn", "Note on the input", warning) for warning in block.warnings)]
 
 
@@ -271,6 +272,14 @@ def _orientation_notices(oriented: OrientResult, names: Mapping[str, str]) -> It
         if items:
             text = f"The pictures contradict the given {what} by what is shown; {used}."
             yield Notice("bad", counted(len(items), f"wrong {what}", f"wrong {what}s"), text, items)
+    tied = tuple(names.get(i, i) for i in (*oriented.by_one_pair, *oriented.by_ground))
+    if tied:
+        title = counted(len(tied), "image hangs on a single pair", "images hang on a single pair each")
+        text = (
+            "A pair tells the direction to an image and not how far off it lies; the given position or the height of "
+            "the ground beside does, less exactly than points of three images would."
+        )
+        yield Notice("warn", title, text, tied)
     for camera_id, focal in oriented.focal_lengths.items():
         text = f"Camera {camera_id}: {focal.found_px:.0f} px in the pictures, {focal.given_px:.0f} px before; {used}."
         yield Notice("warn", "Another focal length", text)

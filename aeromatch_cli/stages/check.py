@@ -46,9 +46,10 @@ _WARM_UP_SCALE = 0.25
 _TRIAL_HEIGHT_M = 100.0
 # Seconds of mapping, and per image: measured 0.04 (300 images of 480 x 360) to 0.4 (8 images, and ochota).
 _MAPPING_S, _MAPPING_S_PER_IMAGE = 1.5, 0.15
-# Seconds of measuring, adjustment, consistency, export and report for one of orientation, features and matching: 0.20
-# to 0.30 in blocks of 7 to 13 images, lewis, ochota, seneca and rendered ones. The page takes some in any block.
-_LATER, _PAGE_S = 0.26, 3.0
+# Seconds of measuring, adjustment, consistency and export, per image with few keypoints, and what so many keypoints
+# (and more) add, by two processes: 80 s for 1,000 images with 200 keypoints, 5 to 8 s for 7 to 12 images with 4,000
+# and more (lewis, ochota, seneca). The page takes some in any block.
+_LATER_S, _LATER_S_PER_IMAGE, _LATER_S_OF_KEYPOINTS, _MANY_KEYPOINTS, _PAGE_S = 1.5, 0.06, 0.35, 4000, 3.0
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
     estimate["seconds_of_further_steps"] = _further_s(seen, sampled)
     if estimate["seconds"] is not None:
         own_s = estimate["seconds"] - estimate["seconds_to_start"] + (estimate["seconds_to_orient"] or 0.0)
-        estimate["seconds_after_matching"] = round(later_s(context, own_s), 1)
+        estimate["seconds_after_matching"] = round(later_s(context), 1)
         estimate["seconds"] = round(estimate["seconds_to_start"] + own_s + estimate["seconds_after_matching"], 1)
     return Check(_lines(context, estimate, len(images) + lost), estimate, failures)
 
@@ -187,10 +188,14 @@ def _looking_down(context: Context) -> Context:
     return replace(context, block=with_gsd(block, (None, None), context.settings.block.max_size_px))
 
 
-def later_s(context: Context, before_s: float) -> float:
-    """Estimate the seconds of what follows matching. before_s: of what leads to it."""
-    adjusts = context.settings.first_pass is not None and not context.settings.match.reads_pixels
-    return before_s * (_LATER if adjusts else 0.0) + (_PAGE_S if context.settings.run.report else 0.0)
+def later_s(context: Context, share: float = 1.0) -> float:
+    """Estimate the seconds of what follows matching, with this share of the keypoints."""
+    settings = context.settings
+    adjusts = settings.first_pass is not None and not settings.match.reads_pixels
+    many = min(1.0, share * getattr(settings.extract, "keypoints", 0) / _MANY_KEYPOINTS)
+    per_image_s = _LATER_S_PER_IMAGE + _LATER_S_OF_KEYPOINTS * many
+    adjustment_s = _LATER_S + len(context.block.images) * per_image_s
+    return adjustment_s * adjusts + _PAGE_S * settings.run.report
 
 
 def _orientation(context: Context, sampled: Sequence[Pair]) -> tuple[float | None, int]:

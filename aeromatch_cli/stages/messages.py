@@ -135,10 +135,14 @@ def _given_words(found: OrientResult, given: Block) -> list[str]:
 def _picture_words(found: OrientResult, given: Block, block: Block) -> list[str]:
     sizes = [str(model.images) for model in found.models] or ["none"]
     groups = sizes[0] if len(sizes) == 1 else f"groups of {', '.join(sizes[:-1])} and {sizes[-1]}"
-    more, on_ground = len(found.by_one_pair), len(found.by_ground)
-    also = f", {more} more by their positions and a pair each" if more else ""
-    also += f", {on_ground} more by a pair each and the height of the ground beside" if on_ground else ""
-    words = [f"from the pictures: {groups} of {len(block.images)} images{also}"]
+    words = [f"from the pictures: {groups} of {len(block.images)} images"]
+    names = {image.image_id: image.name for image in block.images}
+    for tied, told in ((found.by_one_pair, "the given position"), (found.by_ground, "the height of the ground beside")):
+        if tied:
+            words.append(
+                f"{len(tied)} more by a single pair each; {told} tells how far off they lie, less exactly than points "
+                f"of three images: {listed([names[i] for i in tied])}"
+            )
     words += [_explained_words(found)] if _has_attitudes(given) else []
     words += [
         f"by a further first pass, with {one.change}: a group of {one.images_then} images, not {one.images}"

@@ -41,12 +41,13 @@ def prepare(
     overwrite: bool = False,
     dry: bool = False,
     exports: bool = False,
+    again: bool = False,
 ) -> tuple[Context, StageReport, StageReport]:
     """Read the block, orient it, choose the pairs and, unless `dry`, write what the block is.
 
     say: gets the lines of the summary as soon as each is known. index: what is known of the workspace's files. exports:
-    whether the command ends with an export, whose refusals come at once, and not after hours. Returns the context and
-    the reports of orient and pairs.
+    whether the command ends with an export, whose refusals come at once, and not after hours. again: with other
+    settings in the same command, which warns of nothing twice. Returns the context and the reports of orient and pairs.
 
     Raises ConfigError for wrong input lists, InputError when no image or no pair is left, WorkspaceError when the
     workspace cannot be written.
@@ -60,14 +61,15 @@ def prepare(
     for line in given_lines:
         say(line)
     known = [*found.warnings, *as_given.warnings, *_within_memory(settings, executor, found.given.block)]
-    warn(known, found.urgent)
+    tell = (lambda _warnings, _urgent=(): None) if again else warn
+    tell(known, found.urgent)
     _check_images(found.given.block)
     for exporter in settings.export if exports else ():
         exporter.check_images(found.given.block.images)
     given = _context(settings, workspace, executor, index, found, shard, overwrite)
     quality = picture_quality.measured(given, dry=dry)
     looks = picture_quality.remarks(given, quality)
-    warn(looks)
+    tell(looks)
     known += looks
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
     report.started += oriented.seconds  # has its own report
@@ -94,7 +96,7 @@ def prepare(
     context = replace(context, pairs=tuple(pairs))
     for line in result.summary:
         say(line)
-    warn(said_later)
+    tell(said_later)
     _check_pairs(context)
     if not dry:
         report.record_files(context, _write(context, pairs_csv, quality))
@@ -204,6 +206,7 @@ def _check_settings(settings: Settings) -> None:
 
 def chosen_strategies(settings: Settings) -> Iterator[Strategy]:
     yield from (settings.orient, settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
+    yield from settings.cascade
     yield from settings.filter
     yield from settings.export
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from aeromatch_cli import graph, report
-from aeromatch_cli.config import Settings
+from aeromatch_cli.config import Settings, dump
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.files import remove_stale_temporaries, translated_os_errors
+from aeromatch_cli.files import remove_stale_temporaries, translated_os_errors, write_text
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
@@ -86,9 +86,9 @@ def execute(
     part = Shard.parse(shard) if shard else None
     if part and not graph.sharded(command):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
-    if within and (part or command != "run"):
+    if within is not None and (part or command != "run"):
         raise ConfigError("--within is for a whole `aeromatch run`: leave out --within, or --shard")
-    deadline = Deadline(within) if within else None
+    deadline = None if within is None else Deadline(within)
     root = Path(settings.workspace)
     if settings.block.images and command in graph.NEED_RESULTS and not root.exists():
         raise InputError(f"the workspace {root} does not exist: run `aeromatch run`, which makes it, or name another")
@@ -101,14 +101,14 @@ def execute(
             inputs = up_to_date.state_of_inputs(settings) if whole else ""
             before = None if overwrite else up_to_date.unchanged_reports(Workspace(root), inputs)
             if before is not None:
-                return named(_unchanged(settings, before, Said(say)), root)
+                return named(_timed(_unchanged(settings, before, Said(say)), deadline), root)
             run = settings.run
             with (
                 Executor(run.executor, run.jobs, progress, run.scheduler) as executor,
                 _index(Workspace(root.absolute()), command, part) as index,
             ):
                 asked = _Asked(command, settings, executor, index, part, deadline, overwrite, Said(say))
-                result = _repairing(asked)
+                result = _timed(_repairing(asked), deadline)
                 if inputs and not result.failures and not (deadline and deadline.left_out):
                     up_to_date.remember(Workspace(root), index, inputs, result.reports)
             return named(result, root)
@@ -225,11 +225,14 @@ def _attempt(asked: _Asked) -> Result:
     if deadline is not None:
         deadline.left_out.clear()  # of an attempt that met a damaged file
         if smaller := fitting(context, deadline):
-            said(f"within           {deadline.text}: left out for that: {'; '.join(deadline.left_out)}")
-            context, *reports = pairs.prepare(smaller, asked.executor, index=asked.index, exports=exports)
+            said(f"within           to end in {deadline.text}: {'; '.join(deadline.left_out)}")
+            context, _, reports[-1] = pairs.prepare(
+                smaller, asked.executor, index=asked.index, exports=exports, again=True
+            )
             context = context.with_scope(overwrite=asked.overwrite)
     if command == "run":
         reports += _run_all(context, reports[-1], deadline)
+        _keep_asked(workspace, settings, deadline)
     elif context.settings.cascade and command in _AFTER_CASCADE:
         context, made = _cascaded(context) if command == "match" else (_joined(context), [])
         reports += made
@@ -248,14 +251,27 @@ def _attempt(asked: _Asked) -> Result:
     names = {image.image_id: image.name for image in context.block.images}
     failures = all_failures(command, context, reports)
     old_page = command in JUDGED and report.is_of_earlier_results(context.workspace)
-    result = command_result(
+    return command_result(
         command, context.settings, context.workspace, names, reports, failures, said,
         part=context.scope.shard is not None, old_page=old_page,
     )  # fmt: skip
+
+
+def _timed(result: Result, deadline: Deadline | None) -> Result:
+    """The result with what `--within` has left out."""
     if deadline is None:
         return result
     facts = {**result.facts, "left_out": deadline.left_out}
-    return replace(result, lines=(*result.lines, *deadline.words()), facts=facts)
+    return replace(result, lines=(*result.lines, deadline.line()), facts=facts)
+
+
+def _keep_asked(workspace: Workspace, settings: Settings, deadline: Deadline | None) -> None:
+    """Keep the settings that were asked for where `--within` has reduced them, for `aeromatch run WORK`."""
+    if deadline is not None and deadline.left_out:
+        write_text(workspace.asked, dump(settings))
+    else:
+        with translated_os_errors(workspace.asked):
+            workspace.asked.unlink(missing_ok=True)
 
 
 def _there(settings: Settings) -> bool:

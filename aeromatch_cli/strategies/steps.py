@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from aeromatch_cli.nets.precision import DEVICE, Device, Precision
+from aeromatch_cli.nets.precision import DEVICE, Device, Precision, check_device
 from aeromatch_cli.strategies import Strategy
 
 _KEYPOINTS: int | None = Field(
@@ -100,6 +100,11 @@ class LearnedFeatures(Step):
     keypoints: int | None = _KEYPOINTS
     precision: Precision = _PRECISION
     device: Device = DEVICE
+
+    def check_files(self, descriptor_length: int) -> None:
+        """The device is looked for."""
+        super().check_files(descriptor_length)
+        check_device(self.device)
 
 
 STEPS: Mapping[str, type[Step]] = {"guided": GuidedSearch, "learned": LearnedFeatures}

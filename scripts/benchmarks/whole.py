@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.config import Settings
+from aeromatch_cli.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,9 @@ def whole_run(
 
 
 def chosen_images(source: Path, every: int, folder: Path) -> Path:
-    """Folder of links to every k-th image by name."""
+    """Folder of links to every k-th image by name. Raises ConfigError where the source is no folder."""
+    if not source.is_dir():
+        raise ConfigError(f"{source} is no folder: give the folder that holds the real blocks after --data")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for path in sorted(source.iterdir())[::every]:
