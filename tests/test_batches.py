@@ -26,6 +26,7 @@ from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.stages import batches, match
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.driver import PairTask
+from aeromatch_cli.stages.pairs import chosen_strategies
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.matchers.lightglue import inference
@@ -177,12 +178,14 @@ def test_the_stage_writes_what_was_asked_together(matcher: Together, tmp_path: P
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-@pytest.mark.parametrize("setting", ["match.device", "extract.device"])
-def test_a_device_that_is_not_there_is_named(setting: str) -> None:
-    settings = load("oblique" if setting.startswith("extract") else "fusion", [f"{setting}=cuda"])
-    strategy = settings.extract if setting.startswith("extract") else settings.match
+@pytest.mark.parametrize(
+    ("preset", "setting"),
+    [("fusion", "match.device"), ("oblique", "extract.device"), ("auto", "cascade.learned.device")],
+)
+def test_a_device_that_is_not_there_is_named(preset: str, setting: str) -> None:
     with pytest.raises(ConfigError, match="torch sees none on this machine; set `auto`"):
-        strategy.check_files(128)
+        for strategy in chosen_strategies(load(preset, [f"{setting}=cuda"])):
+            strategy.check_files(128)
     assert device_of("auto") == "cpu"
 
 

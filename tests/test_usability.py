@@ -257,7 +257,7 @@ def test_time_estimate_leaves_out_what_happens_once(site, monkeypatch):
     work = len(site.names()) * estimate["seconds_per_image"] + estimate["pairs"] * estimate["seconds_per_pair"]
     assert 0.0 < estimate["seconds_to_orient"] < 10.0
     work += estimate["seconds_to_orient"]
-    few = 1.5 + len(site.names()) * (0.06 + 0.35 * 200 / 4000)  # keypoints of the test's settings; no page
+    few = 1.5 + len(site.names()) * (0.06 + 0.35 * 400 / 4000)  # keypoints of the test's settings; no page
     assert estimate["seconds_after_matching"] == pytest.approx(few, abs=0.06)
     whole = estimate["seconds_to_start"] + work + estimate["seconds_after_matching"]
     assert estimate["seconds"] == pytest.approx(whole, abs=0.2)

@@ -120,7 +120,8 @@ def accidents(given: Any, validated: Any, place: str = "") -> Iterator[str]:
 
 def nearest(word: str, known: Sequence[str], *, otherwise: str | None = None) -> str:
     """`; did you mean 'x'?`, or the list of valid words (or `otherwise`) where none is close."""
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    # Of few short words any is like any: `gpu` is no `cpu`.
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5 if len(known) > 3 else 0.7)
     if close:
         return f"; did you mean {close[0]!r}?"
     if otherwise is not None:

@@ -8,7 +8,7 @@ anywhere along that direction. The given position tells the distance; blocks tha
 of lewis with positions (2 of 16 and 1 of 11 images). A weak model may itself lie beside its positions: then they tell
 the distance from each other (every 4th image of seneca). Without a position the ground does: what the pair shows of it
 is about as high as what the block shows beside it. Blocks that need it: every 4th image of seneca, lewis and ochota
-without positions (1 of 7, 1 of 8, 3 of 10).
+without positions (2 of 7, 1 of 8, 3 of 10).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ import math
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -137,22 +137,28 @@ def table_of(rows: Sequence[Row]) -> str:
 
 
 def _cells(figures: Sequence[Row], sizes: Sequence[int]) -> list[str]:
-    """Of each size the median, with its interval; then by which power of the number of images it has grown."""
+    """Of each size the median, with its interval; then by which power of the number of images it has grown, with what
+    the least and the most of both sizes would give."""
     own = {images: values([row for row in figures if row["images"] == images], "value") for images in sizes}
     middle = {images: float(np.median(found)) for images, found in own.items()}
     cells = [ranged(middle[n], interval(own[n], medians), 1 if middle[n] < 100 else 0) for n in sizes]
     for before, after in pairwise(sizes):
-        grown = middle[before] > 0.0 and middle[after] > 0.0
-        power = math.log(middle[after] / middle[before]) / math.log(after / before) if grown else math.nan
-        cells.append(number(power, 2))
+        powers = [_power(a, b, after / before) for a, b in product(own[before], own[after])]
+        bounds = (min(powers), max(powers)) if len(powers) > 1 else (math.nan, math.nan)
+        cells.append(ranged(_power(middle[before], middle[after], after / before), bounds, 2))
     return cells
+
+
+def _power(before: float, after: float, times: float) -> float:
+    """By which power of a number a figure has grown, while the number has grown `times`."""
+    return math.log(after / before) / math.log(times) if min(before, after) > 0.0 else math.nan
 
 
 def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("growth", __doc__)
     add = parser.add_argument
     add("--images", type=options.numbers, default="100,300,1000", help="of each block, comma-separated, ascending")
-    add("--repeats", type=options.numbers, default="3,2,1", help="runs of each block, comma-separated")
+    add("--repeats", type=options.numbers, default="3,2,2", help="runs of each block, comma-separated")
     add("--preset", default="baseline")
     add("--keypoints", type=options.positive, default=200)
     add("--seed", type=int, default=0)

@@ -58,24 +58,31 @@ def words(run: str, given: Mapping[str, str], *, docs: bool = False, quick: bool
 def main(arguments: Sequence[str]) -> int:
     parser = options.make_parser("results", __doc__)
     add = parser.add_argument
-    add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
+    add("--data", type=Path, metavar="DIR", help="folder of real blocks: BLOCK/images and BLOCK/reference")
     add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks; else without")
     add("--only", type=options.names, default=",".join(STANDING), help="comma-separated")
     add("--docs", action="store_true", help="write the tables into docs/results and their figures into the README")
     add("--list", action="store_true", help="print the commands and their planned minutes instead of running them")
     add("--quick", action="store_true", help="all of them small: figures without worth, in minutes")
-    add("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
+    add("--out", type=Path, metavar="DIR", help="folder of results; a killed run goes on where it was")
     args = options.parse(parser, arguments)
     if unknown := sorted(set(args.only) - set(STANDING)):
         parser.error(f"--only: {', '.join(unknown)} are none of {', '.join(STANDING)}")
-    folder = code_digest("")[:8] + ("-quick" if args.quick else "")
-    given = {"DATA": str(args.data.resolve()), "OUT": str(args.out.resolve() / folder)}
-    if args.reference_weights:
-        given["WEIGHTS"] = str(args.reference_weights.resolve())
+    if args.docs and args.quick:
+        parser.error("--docs and --quick: small runs make figures without worth, which do not belong into docs/results")
+    if not args.list and (args.data is None or args.out is None):
+        parser.error("give the folder of real blocks with --data, and one for results with --out")
+    for folder in (args.data, args.reference_weights):
+        if folder is not None and not folder.is_dir():
+            parser.error(f"{folder} is no folder")
+    state = code_digest("")[:8] + ("-quick" if args.quick else "")
+    given = {"DATA": _text(args.data), "OUT": _text(args.out and args.out / state)}
+    if args.reference_weights or args.list:
+        given["WEIGHTS"] = _text(args.reference_weights)
     failed = []
     for name in args.only:
         standing, started = STANDING[name], time.monotonic()
-        print(f"# {name}: about {standing.minutes} minutes", flush=True)
+        print(f"# {name}" + ("" if args.quick else f": about {standing.minutes} minutes"), flush=True)
         for run in standing.runs:
             asked = words(run, given, docs=args.docs, quick=args.quick)
             print(shlex.join(["scripts/bench", *asked]), flush=True)
@@ -88,6 +95,10 @@ def main(arguments: Sequence[str]) -> int:
     for command in failed:
         print(f"failed: {command}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def _text(folder: Path | None) -> str:
+    return "DIR" if folder is None else str(folder.resolve())
 
 
 def _run(asked: Sequence[str]) -> int:

@@ -112,8 +112,8 @@ def of_settings(*every: Settings, families: Collection[str] = tuple(FAMILIES)) -
 
 
 def of_pipeline() -> dict[str, Version]:
-    """Of tables that state seconds and memory, which no strategy's results change."""
-    return {"pipeline": PIPELINE_VERSION}
+    """Of tables that state seconds and memory of whole runs."""
+    return {"pipeline": PIPELINE_VERSION, **_ORIENTATION}
 
 
 def of_matching(*every: Settings) -> dict[str, Version]:

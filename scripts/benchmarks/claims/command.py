@@ -11,6 +11,7 @@ of memory.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def make_options() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--seed", type=int, default=1, help="another seed gives other blocks, grounds, pairs and samples")
     add("--data", type=Path, metavar="DIR", help="folder of real blocks (seneca, caliterra)")
-    add("--reference-weights", type=Path, metavar="DIR", help="folder with superpoint_v1.pth, for who has it")
+    add("--reference-weights", type=Path, metavar="DIR", help="folder that may hold superpoint_v1.pth")
     add("--pairs", type=options.positive, default=8, help="of each rendered block of papers A and C")
     add("--size", metavar="WxH", default="7360x5400", help="of paper B's pictures with known parameters")
     options.add_output(parser)
@@ -41,15 +42,20 @@ def main(arguments: Sequence[str]) -> None:
     parser = make_options()
     args = options.parse(parser, arguments, QUICK)
     seed, pairs, out = args.seed, args.pairs, args.out
+    try:
+        size = options.size_px(args.size)
+    except ValueError:
+        parser.error(f"--size {args.size}: write WIDTHxHEIGHT in pixels, as 7360x5400")
     weights = args.reference_weights
     if weights is not None and not (weights / "superpoint_v1.pth").is_file():
+        print(f"{weights} does not hold superpoint_v1.pth: SuperPoint is not run", file=sys.stderr)
         weights = None
     scenes = [*shadow.scenes(seed, pairs, out), *features.scenes(seed, pairs, out), *registration.scenes(seed, out)]
     prepare(scenes, JOBS)
     units = [
         *shadow.units(seed, pairs, out),
         *features.units(seed, pairs, weights, out),
-        *registration.units(seed, options.size_px(args.size), args.data, out),
+        *registration.units(seed, size, args.data, out),
     ]
     rows = made(units, out / "rows", JOBS)
     write_rows(out / "claims.json", rows)

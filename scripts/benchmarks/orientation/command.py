@@ -48,9 +48,6 @@ from benchmarks.orientation.figures import judged
 from benchmarks.tables import Column, Row, markdown, percent, ranged, ratio
 from benchmarks.whole import chosen_images, evaluated, whole_run
 
-# Characters of a remark in the table.
-_SAID = 80
-
 
 def run_case(args: Any, block: str, every: int, case: str) -> Row:
     """One run of the command and its figures; kept in OUT, so that a killed benchmark goes on there."""
@@ -154,7 +151,6 @@ COLUMNS: Sequence[Column[Row]] = (
     ("share", lambda row: percent(row["share"], 1) if "share" in row else ""),
     ("terrain", lambda row: "" if row.get("terrain_share") is None else percent(row["terrain_share"], 1)),
     ("s", _seconds),
-    ("said", lambda row: "; ".join(remark[:_SAID] for remark in row["said"])),
 )
 
 
