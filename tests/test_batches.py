@@ -183,9 +183,9 @@ def test_the_stage_writes_what_was_asked_together(matcher: Together, tmp_path: P
     [("fusion", "match.device"), ("oblique", "extract.device"), ("auto", "cascade.learned.device")],
 )
 def test_a_device_that_is_not_there_is_named(preset: str, setting: str) -> None:
+    strategies = list(chosen_strategies(load(preset, [f"{setting}=cuda"])))
     with pytest.raises(ConfigError, match="torch sees none on this machine; set `auto`"):
-        for strategy in chosen_strategies(load(preset, [f"{setting}=cuda"])):
-            strategy.check_files(128)
+        [strategy.check_files(128) for strategy in strategies]
     assert device_of("auto") == "cpu"
 
 

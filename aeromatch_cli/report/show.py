@@ -28,6 +28,7 @@ from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
 from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult
+from aeromatch_cli.sfm.georeferencing import LOCAL_FLYING_HEIGHT
 from aeromatch_cli.sfm.quality.finding import Quality
 from aeromatch_cli.stages.cascade import feature_workspaces
 from aeromatch_cli.stages.inspect_image import steps_of_image
@@ -270,7 +271,10 @@ def _pose_words(pose: Pose | None, origin_m: Sequence[float], *, metric: bool) -
         return
     x, y, z = np.array(pose.center_m) + np.array(origin_m)
     unit = "m" if metric else "units of arbitrary length"
-    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} {unit}, standard deviation {pose.sigma_position_m:.3g} {unit}"
+    exact = f"standard deviation {pose.sigma_position_m:.3g} {unit}"
+    if not metric and pose.sigma_position_m > LOCAL_FLYING_HEIGHT:
+        exact = "its distance is not determined by the matches"
+    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} {unit}, {exact}"
     if pose.world_rotation is not None:
         angles = ", ".join(f"{v:.4f}" for v in to_omega_phi_kappa(pose.world_rotation))
         yield f"omega, phi, kappa {angles} degrees, {tilt_deg(pose.world_rotation):.1f} from straight down"

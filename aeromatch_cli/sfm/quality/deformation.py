@@ -56,7 +56,10 @@ def deformation(evidence: QualityInput) -> Found:
 
 
 def _length(heights: HeightErrors, value: float) -> str:
-    """A length in ground pixels and, where it has them, in metres."""
+    """A length in ground pixels and, where it has them, in metres; in words where the errors are beyond the linear
+    model that states them, as of an image that hangs on one pair."""
+    if value > heights.reach:
+        return "farther than the block extends"
     return f"{heights.in_pixels(value):.1f} ground pixels" + (f" ({plain(value)} m)" if heights.metric else "")
 
 
