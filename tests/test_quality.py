@@ -233,6 +233,8 @@ def test_flights_are_named_once_and_large_numbers_have_no_powers_of_ten() -> Non
     assert judged_with(group=flights).faults[0].sentence.startswith("heights of flight 2 (6 images) lie 14.9 m")
     sentence = found(judged_with(group=heights(bowl=112.0)), "bowl").sentence
     assert "(112 m)" in sentence
+    beyond = found(judged_with(group=heights(bowl=5e4)), "bowl").sentence
+    assert "may lie many times farther than the block extends above or below" in beyond
     assert [plain(value) for value in (112.3, 9.99, 2.86, 0.034)] == ["112", "10", "2.9", "0.034"]
 
 

@@ -16,6 +16,8 @@ _BOWL_PIXELS: Limits = (5.0, None)
 TILT_DEG: Limits = (2.0, None)
 # Expected errors of heights as a whole: ground pixels, or so many standard deviations of the heights of positions.
 _HEIGHT_PIXELS, _HEIGHT_SIGMAS = 5.0, 3.0
+# Errors of so many times the block's reach say no more than that something is not determined.
+_MEANINGLESS = 10.0
 _STRIPS = "two strips across, images from another height, or three control points determine it"
 
 
@@ -58,8 +60,8 @@ def deformation(evidence: QualityInput) -> Found:
 def _length(heights: HeightErrors, value: float) -> str:
     """A length in ground pixels and, where it has them, in metres; in words where the errors are beyond the linear
     model that states them, as of an image that hangs on one pair."""
-    if value > heights.reach:
-        return "farther than the block extends"
+    if value > _MEANINGLESS * heights.reach:
+        return "many times farther than the block extends"
     return f"{heights.in_pixels(value):.1f} ground pixels" + (f" ({plain(value)} m)" if heights.metric else "")
 
 
