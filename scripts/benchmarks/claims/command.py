@@ -49,7 +49,6 @@ def main(arguments: Sequence[str]) -> None:
     weights = args.reference_weights
     if weights is not None and not (weights / "superpoint_v1.pth").is_file():
         print(f"{weights} does not hold superpoint_v1.pth: SuperPoint is not run", file=sys.stderr)
-        weights = None
     scenes = [*shadow.scenes(seed, pairs, out), *features.scenes(seed, pairs, out), *registration.scenes(seed, out)]
     prepare(scenes, JOBS)
     units = [

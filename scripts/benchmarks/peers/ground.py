@@ -54,7 +54,8 @@ class OnGround:
         kept = np.flatnonzero(away_from_unseen(found.places_px, seen, _MARGIN_PX))
         places = view.stored_px(found.places_px[kept])
         usable = np.flatnonzero(inside(places, view.camera))[: self.keypoints]
-        return Described(places[usable], found.descriptors[kept[usable]])
+        rows = kept[usable]
+        return Described(places[usable], found.descriptors[rows], found.places_px[rows], found.size_px)
 
     def match(self, image0: str, image1: str, features0: Described, features1: Described) -> Found:
         return self.peer.match(image0, image1, features0, features1)

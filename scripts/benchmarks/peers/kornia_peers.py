@@ -10,12 +10,12 @@ from aeromatch_cli.errors import ConfigError
 from benchmarks.peers.base import Described, Options, Scene, read_colour, read_gray, read_weights, strongest
 from benchmarks.peers.matching import Peer
 
-_WEIGHTS = "aliked-n16rot.pth"
+ALIKED_ROTATED, ALIKED = "aliked-n16rot", "aliked-n16"
 _DERIVED = {"dkd.hw_grid"}  # a derived buffer that kornia does not keep
 
 
 class Aliked(Peer):
-    """ALIKED (n16rot, the rotation-trained weights) through kornia.
+    """ALIKED through kornia, by default n16rot, the rotation-trained weights.
 
     Colour images; the B strongest maxima of its score map, whatever its threshold. No ratio: its users match by mutual
     neighbours. Source: Zhao et al., IEEE TIM 2023.
@@ -23,23 +23,25 @@ class Aliked(Peer):
 
     ratio = None
 
-    def __init__(self, scene: Scene, options: Options) -> None:
+    def __init__(self, scene: Scene, options: Options, *, model: str = ALIKED_ROTATED) -> None:
         from kornia.feature import ALIKED
 
         super().__init__(scene, options)
         most = options.keypoints
-        self.network: Any = ALIKED("aliked-n16rot", max_num_keypoints=most, detection_threshold=0.0).eval()
-        missing, unexpected = self.network.load_state_dict(read_weights(options, _WEIGHTS), strict=False)
+        self.network: Any = ALIKED(model, max_num_keypoints=most, detection_threshold=0.0).eval()
+        missing, unexpected = self.network.load_state_dict(read_weights(options, f"{model}.pth"), strict=False)
         if unexpected or set(missing) - _DERIVED:
-            raise ConfigError(f"{_WEIGHTS} does not fit kornia's ALIKED: missing {missing}, unexpected {unexpected}")
+            raise ConfigError(f"{model}.pth does not fit kornia's ALIKED: missing {missing}, unexpected {unexpected}")
 
     def features(self, image: str) -> Described:
         import torch
 
+        pixels = read_colour(self.scene, image)
         with torch.inference_mode():
-            one = self.network(read_colour(self.scene, image))[0]
+            one = self.network(pixels)[0]
         sides = (one.keypoints.numpy(), one.keypoint_scores.numpy(), one.descriptors.numpy())
-        return strongest(*sides, self.options.keypoints)
+        size_px = int(pixels.shape[3]), int(pixels.shape[2])
+        return strongest(*sides, self.options.keypoints, size_px=size_px)
 
 
 TFEAT, HARD_TFEAT = "tfeat-liberty.params", "HardTFeat.pth"

