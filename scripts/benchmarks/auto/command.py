@@ -12,8 +12,8 @@
               positions that are off by 5 m or nothing, cameras from EXIF: images in the largest group of the adjusted
               block, beside what both of pycolmap's mappers (incremental / global) register from the same run's export
               and from pycolmap's own chain: its SIFT of the same size and number, exhaustive guided matching. Right:
-              attitudes within 3 degrees of the reference after one common turn. Points, error, seconds of pycolmap: of
-              the mapper that registers more; seconds are those of the whole chain
+              attitudes within 3 degrees of the reference after one common turn. Points: of the exported model. Points,
+              error, seconds of pycolmap: of the mapper that registers more; seconds are those of the whole chain
 
 Correct: within 3 px of the exact place in both directions. Right: the share of the kept matches that is correct, in the
 block where it is least, too. Auto / it: correct matches on the same pairs. Seconds: of whole runs without report on one

@@ -75,7 +75,8 @@ def _by_preset(args: argparse.Namespace, images: Path, reference: Path, folder: 
         groups = run.answer["stages"]["adjust"]["result"].get("groups", [])
         best = max(groups, key=lambda group: group["images"], default={"images": 0})
         row["registered"] = best["images"]
-        row |= {key: best.get(key) for key in ("points", "track_length", "reprojection_error_px")}
+        row |= {key: best.get(key) for key in ("track_length", "reprojection_error_px")}
+        row["points"] = run.answer["stages"]["consistency"]["result"].get("points_left", best.get("points"))
         row["right"] = _right(attitudes_of(work / "orientation" / "orientation.csv"), reference)
         database = work / "export" / "colmap" / "database.db"
         row |= {f"by_{m}": map_database(database, images, m).get("registered", 0) for m in MAPPERS}
