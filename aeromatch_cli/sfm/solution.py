@@ -122,7 +122,7 @@ def from_given(evidence: FirstPassMatches, good: set[str], *, correct: bool) -> 
     terrains, points = _terrains(evidence, seen, groups, cameras)
     result = OrientResult(
         poses_from="given poses",
-        frame="world",
+        frame="world" if block.poses else "own",
         corrected=sorted(found) if correct else [],
         stays=not correct,
         remarks=[],
@@ -216,7 +216,7 @@ def from_models(
     result = OrientResult(
         poses_from="pictures",
         stays=False,
-        frame="own" if own else "world",
+        frame="own" if own or not block.poses else "world",
         models=[model.figures for model in models],
         by_one_pair=sorted(tied),
         by_ground=sorted(on_ground),

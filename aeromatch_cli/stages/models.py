@@ -162,7 +162,7 @@ def _one_round(
     for mapper in (recipe.mapper, *(name for name in MAPPERS if name != recipe.mapper)):
         try:
             mapped = _mapped_images(context, first, mapper, image_ids)
-            found = _sound_parts(context, evidence, mapped)
+            found = _sound_parts(context, first, evidence, mapper, mapped)
         except InputError as error:  # the other mapper may do
             log.warning("warning: %s", error)
             fault = error
@@ -175,16 +175,35 @@ def _one_round(
     return best
 
 
-def _sound_parts(context: Context, evidence: FirstPassMatches, models: Sequence[Model]) -> list[Model]:
+def _sound_parts(
+    context: Context, first: Context, evidence: FirstPassMatches, mapper: Mapper, models: Sequence[Model]
+) -> list[Model]:
     """The models as far as they explain their matches, each image in the largest that has it."""
     found: list[Model] = []
     taken: set[str] = set()
     for model in sorted(models, key=lambda model: -len(model.rotations)):
         part = _sound(context, evidence, only(model, model.rotations.keys() - taken))
+        if part is not None and len(part.rotations) < _WHOLE * len(model.rotations):
+            part = _by_itself(context, first, evidence, mapper, part)
         if part is not None:
             found.append(part)
             taken |= part.rotations.keys()
     return found
+
+
+def _by_itself(context: Context, first: Context, evidence: FirstPassMatches, mapper: Mapper, part: Model) -> Model:
+    """The part of a model mapped once more without the others, with which it was placed, levelled and scaled: as they
+    are in wrong places, so is it.
+
+    A block that needs it: every 3rd image of brighton, two triples of images that share one.
+    """
+    try:
+        again = _mapped_images(context, first, mapper, set(part.rotations))
+    except InputError:  # of fewer images than before
+        return part
+    sound = [one for model in again if (one := _sound(context, evidence, model)) is not None]
+    best = max(sound, key=lambda model: len(model.rotations), default=part)
+    return best if len(best.rotations) >= len(part.rotations) else part
 
 
 def _sound(context: Context, evidence: FirstPassMatches, model: Model) -> Model | None:
