@@ -161,8 +161,8 @@ def main(arguments: Sequence[str]) -> None:
     add("--repeats", type=options.numbers, default="3,2,2", help="runs of each block, comma-separated")
     add("--preset", default="baseline")
     add("--keypoints", type=options.positive, default=200)
-    add("--seed", type=int, default=0)
-    add("--jobs", type=options.positive, default=2)
+    add("--seed", type=int, default=0, help="another seed gives other blocks")
+    add("--jobs", type=options.positive, default=2, help="processes at a time")
     options.add_output(parser)
     args = options.parse(parser, arguments, {"images": "20,40", "repeats": "2,1"})
     if len(args.images) != len(args.repeats):

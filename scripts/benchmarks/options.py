@@ -15,10 +15,17 @@ from benchmarks.pages import write_table
 from benchmarks.stamps import Version, make_stamp
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """The description as it is written, and the default of every option that has one."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        said = action.help or ""
+        shown = action.option_strings and action.default not in (None, False, argparse.SUPPRESS)
+        return f"{said} (default: {action.default})" if shown else said
+
+
 def make_parser(name: str, about: str | None) -> argparse.ArgumentParser:
-    return argparse.ArgumentParser(
-        prog=f"scripts/bench {name}", description=about, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    return argparse.ArgumentParser(prog=f"scripts/bench {name}", description=about, formatter_class=_Help)
 
 
 def parse(

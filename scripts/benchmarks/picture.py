@@ -78,7 +78,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     add("--picture", type=Path, default=REPOSITORY / ".assets" / "pair.jpg", metavar="FILE", help="the JPEG")
     add("--scene", default="city")
     add("--flight", default="mixed")
-    add("--seed", type=int, default=1)
+    add("--seed", type=int, default=1, help="another seed gives other blocks")
     add("--images", type=options.positive, default=16)
     add("--pair", type=options.names, default="city_0004.jpg,city_0010.jpg", metavar="NAME,NAME")
     add("--preset", default="oblique")

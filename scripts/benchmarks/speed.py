@@ -234,8 +234,8 @@ def main(arguments: Sequence[str]) -> None:
     add("--keypoints", type=options.positive, default=8000, help="SIFT keypoints per image, of all chains")
     add("--repeats", type=options.positive, default=2, help="runs of each chain")
     add("--keep", action="store_true", help="leave the workspaces in OUT")
-    add("--seed", type=int, default=64)
-    add("--jobs", type=options.positive, default=2)
+    add("--seed", type=int, default=64, help="another seed gives other blocks")
+    add("--jobs", type=options.positive, default=2, help="processes at a time")
     options.add_output(parser)
     args = options.parse(parser, arguments, {"images": "6", "megapixels": "1", "keypoints": 2000, "repeats": 1})
     if len(args.images) not in (1, len(args.megapixels)):

@@ -103,7 +103,7 @@ def _real(arguments: Sequence[str]) -> None:
     add("--presets", type=split_methods, default=JUDGED, help="comma-separated")
     add("--keypoints", type=options.positive, default=4000, help="SIFT descriptors per image")
     add("--max-size", type=options.positive, default=1600, help="longer side of images, px")
-    add("--jobs", type=options.positive, default=2)
+    add("--jobs", type=options.positive, default=2, help="processes at a time")
     options.add_output(parser)
     quick = {"blocks": "seneca", "thin": "5", "presets": "baseline", "keypoints": 1000, "max_size": 800}
     args = options.parse(parser, arguments, quick)

@@ -188,7 +188,7 @@ def main(arguments: Sequence[str]) -> None:
     add("--seeds", type=options.numbers, default="1-3")
     add("--points", type=options.positive, default=500, help="about so many tie points in an image")
     add("--peers", type=options.names, default="colmap-opencv", help=f"of {', '.join(PEERS)}")
-    add("--jobs", type=options.positive, default=2)
+    add("--jobs", type=options.positive, default=2, help="processes at a time")
     options.add_output(parser)
     quick = {"scenes": "farmland", "flights": "cross", "images": "12", "seeds": "1", "points": 300}
     args = options.parse(parser, arguments, quick)

@@ -132,7 +132,7 @@ def main(arguments: Sequence[str]) -> None:
     add = parser.add_argument
     add("--only", default="", metavar="WORDS", help="blocks whose names hold these words")
     add("--points", type=options.positive, default=1000, help="about so many tie points in an image")
-    add("--jobs", type=options.positive, default=2)
+    add("--jobs", type=options.positive, default=2, help="processes at a time")
     options.add_output(parser)
     args = options.parse(parser, arguments, {"only": "factory", "points": 500})
     names = [(name, kind) for kind, some in (("spoilt", FAULTS), ("good", GOOD)) for name in some if args.only in name]
