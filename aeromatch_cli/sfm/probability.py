@@ -30,8 +30,8 @@ _NOWHERE_PX = 16.0
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/train probability` has found them.
 WEIGHTS = (4.818, 2.247, 1.148, -0.732, -1.268, -3.094)
-# No more is asked of a match for the sake of all: images without third ones have few that are surer, and every 4th image
-# of lewis would lose a fifth of its matches for 0.95.
+# No more is asked of a match for the sake of all: images without third ones have few that are surer, and every 4th
+# image of lewis would lose a fifth of its matches for 0.95.
 _MOST_ASKED = 0.93
 # Matches left to a pair without which images fall apart: enough for a relative orientation, few among all others.
 _BRIDGING = 30
