@@ -10,8 +10,10 @@ from test_orientation import CAMERA, flight, limits, matches
 
 from aeromatch_cli.data import Pose
 from aeromatch_cli.geometry.rotations import angle_between_deg
+from aeromatch_cli.results.stages import OrientResult
 from aeromatch_cli.sfm.epipolar_agreement import PairPoints
 from aeromatch_cli.sfm.pair_registration import tied_by_ground, tied_by_pairs
+from aeromatch_cli.stages.messages import single_pair_words
 
 LAST = "i23"
 
@@ -122,3 +124,15 @@ def test_positions_tell_the_distance_from_each_other_where_the_model_lies_beside
     # Positions of which one alone is wrong tell nothing.
     assert tied(truth, {**given, LAST: aside[LAST]}, pairs) == {}
     assert anchor in (pairs[-1].image_id0, pairs[-1].image_id1)
+
+
+def test_images_that_hang_on_a_single_pair_are_named() -> None:
+    found = OrientResult(
+        poses_from="pictures", stays=False, frame="own", points=9, wrong_attitudes={}, wrong_positions={},
+        focal_lengths={}, outside=[], by_one_pair=["a"], by_ground=["b", "c"],
+    )  # fmt: skip
+    by_position, by_ground = single_pair_words(found, {i: f"{i}.jpg" for i in "abc"})
+    assert by_position.startswith("1 by a single pair each; the given position tells how far off they lie")
+    assert by_ground.startswith("2 by a single pair each; the height of the ground beside tells how far off they lie")
+    assert (by_position.endswith(": a.jpg"), by_ground.endswith(": b.jpg, c.jpg")) == (True, True)
+    assert single_pair_words(found.model_copy(update={"by_one_pair": [], "by_ground": []}), {}) == []

@@ -28,6 +28,7 @@ from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES
 from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.messages import single_pair_words
 from aeromatch_cli.stages.models import remapped
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.state import BlockState
@@ -55,8 +56,7 @@ def run(context: Context) -> StageReport:
     if report.take_if_up_to_date(context):
         return report.write(context.workspace)
     _remove(context)
-    first = _images(groups)
-    context, groups = _with_more_images(context, groups)
+    context, groups, words = _with_more_images(context, groups)
     if not groups:
         report.result = AdjustResult(images=0, remarks=[_NOTHING])
         return report.write(context.workspace)
@@ -70,30 +70,30 @@ def run(context: Context) -> StageReport:
         return report.write(context.workspace)
     residuals = _residuals(context, adjusted)
     result = _result(context, adjusted, found, residuals, without_results)
-    if len(_images(groups)) > len(first):
-        words = f"oriented from the verified matches: {len(_images(groups))} images, {len(first)} from the first pass"
-        result = result.model_copy(update={"remarks": [words, *result.remarks]})
-    report.result = result
+    report.result = result.model_copy(update={"remarks": [*words, *result.remarks]})
     report.done = report.items
     report.record_files(context, _write(context, adjusted, residuals))
     return report.write(context.workspace)
 
 
-def _with_more_images(context: Context, groups: Sequence[Group]) -> tuple[Context, Sequence[Group]]:
+def _with_more_images(context: Context, groups: Sequence[Group]) -> tuple[Context, Sequence[Group], list[str]]:
     """Return the context and the groups of images with the orientation from the verified matches, where the first pass
-    has left out images that these tie, and that has more of them.
+    has left out images that these tie, and that has more of them; and remarks on it.
 
     A block that needs it: every 4th image of lewis, with positions from GPS.
     """
     oriented = _images(groups)
     tied = {i for pair, known in BlockState.of(context).known_verdicts() if known.state == "verified" for i in pair.ids}
     if tied <= oriented or len(tied) < FEWEST_IMAGES or len(context.block.images) > LARGE_BLOCK:
-        return context, groups
+        return context, groups, []
     found = remapped(context)
-    if found is None or len(_images(found.groups)) <= len(oriented):
-        return context, groups
+    images = set() if found is None else _images(found.groups)
+    if found is None or len(images) <= len(oriented):
+        return context, groups, []
     block = replace(context.block, cameras=found.cameras, poses=found.poses)
-    return replace(context, block=block), found.groups
+    words = f"oriented from the verified matches: {len(images)} images, {len(oriented)} from the first pass"
+    names = {image.image_id: image.name for image in context.block.images}
+    return replace(context, block=block), found.groups, [words, *single_pair_words(found.result, names)]
 
 
 def _images(groups: Sequence[Group]) -> set[str]:

@@ -136,13 +136,7 @@ def _picture_words(found: OrientResult, given: Block, block: Block) -> list[str]
     sizes = [str(model.images) for model in found.models] or ["none"]
     groups = sizes[0] if len(sizes) == 1 else f"groups of {', '.join(sizes[:-1])} and {sizes[-1]}"
     words = [f"from the pictures: {groups} of {len(block.images)} images"]
-    names = {image.image_id: image.name for image in block.images}
-    for tied, told in ((found.by_one_pair, "the given position"), (found.by_ground, "the height of the ground beside")):
-        if tied:
-            words.append(
-                f"{len(tied)} more by a single pair each; {told} tells how far off they lie, less exactly than points "
-                f"of three images: {listed([names[i] for i in tied])}"
-            )
+    words += single_pair_words(found, {image.image_id: image.name for image in block.images})
     words += [_explained_words(found)] if _has_attitudes(given) else []
     words += [
         f"by a further first pass, with {one.change}: a group of {one.images_then} images, not {one.images}"
@@ -154,6 +148,17 @@ def _picture_words(found: OrientResult, given: Block, block: Block) -> list[str]
     elif found.frame == "own" and given.poses:
         words.append("in a frame of its own, not that of the given positions")
     return words
+
+
+def single_pair_words(found: OrientResult, names: Mapping[str, str]) -> list[str]:
+    """Name the images that hang on the others by a single pair, and what tells their distance."""
+    ways = (found.by_one_pair, "the given position"), (found.by_ground, "the height of the ground beside")
+    return [
+        f"{len(tied)} by a single pair each; {told} tells how far off they lie, less exactly than points of three "
+        f"images: {listed([names[i] for i in tied])}"
+        for tied, told in ways
+        if tied
+    ]
 
 
 def frame_remarks(found: OrientResult, groups: Sequence[Group]) -> list[str]:
