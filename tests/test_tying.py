@@ -129,7 +129,7 @@ def test_positions_tell_the_distance_from_each_other_where_the_model_lies_beside
 def test_images_that_hang_on_a_single_pair_are_named() -> None:
     found = OrientResult(
         poses_from="pictures", stays=False, frame="own", points=9, wrong_attitudes={}, wrong_positions={},
-        focal_lengths={}, outside=[], by_one_pair=["a"], by_ground=["b", "c"],
+        focal_lengths={}, outside=[], remarks=[], by_one_pair=["a"], by_ground=["b", "c"],
     )  # fmt: skip
     by_position, by_ground = single_pair_words(found, {i: f"{i}.jpg" for i in "abc"})
     assert by_position.startswith("1 by a single pair each; the given position tells how far off they lie")
