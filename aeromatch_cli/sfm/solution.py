@@ -137,7 +137,7 @@ def from_given(evidence: FirstPassMatches, good: set[str], *, correct: bool) -> 
 
 def unoriented_remark(evidence: FirstPassMatches) -> str:
     """Say why no image could be oriented from its matches."""
-    said = "no image could be oriented from the pictures"
+    said = "the first pass could orient no image from the pictures"
     if len(evidence.block.images) < 2:
         return f"{said}: one image has none to be compared with"
     if not evidence.pairs:
