@@ -197,7 +197,10 @@ def test_identical_pictures_are_named(site: Site) -> None:
         site.image(number).write_bytes(first)
     outcome = site("orient", "--poses", "none")
     assert outcome.code == 0
-    assert "the first pass could orient no image from the pictures: they show the same from the same place" in outcome.stderr
+    assert (
+        "the first pass could orient no image from the pictures: they show the same from the same place"
+        in outcome.stderr
+    )
     assert "from the pictures: none of 5 images" in outcome.stdout
 
 
