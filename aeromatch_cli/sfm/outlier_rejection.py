@@ -60,6 +60,7 @@ class Limits:
 
     @property
     def by_probability(self) -> bool:
+        """Whether it is asked how likely matches are to be right."""
         return max(self.min_probability, self.min_expected_right) > 0.0
 
 

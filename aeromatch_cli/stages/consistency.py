@@ -99,7 +99,7 @@ def run(context: Context) -> StageReport:
 def _judges_pairs(context: Context) -> bool:
     """Whether pairs are judged that no adjusted block holds."""
     recipe = context.settings.rejection
-    return recipe is not None and recipe.judges_probability
+    return recipe is not None and limits_of(recipe).by_probability
 
 
 def limits_of(recipe: BlockConsistency) -> Limits:

@@ -55,11 +55,6 @@ class BlockConsistency(Strategy):
         "them wrong.",
     )
 
-    @property
-    def judges_probability(self) -> bool:
-        """Whether it is asked how likely matches are to be right."""
-        return self.min_probability > 0.0 or self.min_expected_right > 0.0
-
 
 class NoConsistency(Strategy):
     """Verified matches stay as the two images alone verify them."""

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from benchmarks import options, stamps
 from benchmarks.processes import children_seconds, run_watched
-from benchmarks.tables import Row, interval, markdown, medians, number, ranged, values, write_rows
+from benchmarks.tables import Row, extremes, interval, markdown, medians, number, ranged, values, write_rows
 
 _WIDTH, _HEIGHT, _FOCAL, _GSD_M = 160, 120, 200.0, 0.5
 _STEP_X, _STEP_Y = 48, 48
@@ -144,8 +144,7 @@ def _cells(figures: Sequence[Row], sizes: Sequence[int]) -> list[str]:
     cells = [ranged(middle[n], interval(own[n], medians), 1 if middle[n] < 100 else 0) for n in sizes]
     for before, after in pairwise(sizes):
         powers = [_power(a, b, after / before) for a, b in product(own[before], own[after])]
-        bounds = (min(powers), max(powers)) if len(powers) > 1 else (math.nan, math.nan)
-        cells.append(ranged(_power(middle[before], middle[after], after / before), bounds, 2))
+        cells.append(ranged(_power(middle[before], middle[after], after / before), extremes(powers), 2))
     return cells
 
 

@@ -42,6 +42,7 @@ from benchmarks.stamps import REPOSITORY
 from benchmarks.tables import (
     Row,
     code,
+    extremes,
     grouped,
     markdown,
     median,
@@ -201,7 +202,8 @@ def table_of(rows: Sequence[Row]) -> str:
         cells = [percent(share) if share else "-" for share in [*shares, 1.0 - sum(shares)]]
         oriented = f"{min(row['oriented'] for row in own)} of {own[0]['images']}"
         lines.append(
-            (scene, megapixels, code(chain), oriented, number(median(own, "seconds")), _span(ours, 0), *beside,
+            (scene, megapixels, code(chain), oriented, number(median(own, "seconds")),
+             ranged(float(np.median(ours)), extremes(ours), 0), *beside,
              number(median(own, "peak_mb")), *cells)
         )  # fmt: skip
     return markdown((*heads, "peak, MB", *STAGES, "rest"), lines)
@@ -212,16 +214,7 @@ def _times(ours: Sequence[float], theirs: Sequence[float]) -> str:
     ratios = [a / b for a, b in product(ours, theirs)]
     if not ratios or ours is theirs:
         return "-"
-    return ranged(float(np.median(ours) / np.median(theirs)), _range(ratios), 2, " x")
-
-
-def _span(seconds: Sequence[float], digits: int) -> str:
-    return ranged(float(np.median(seconds)), _range(seconds), digits)
-
-
-def _range(figures: Sequence[float]) -> tuple[float, float]:
-    """The least and the most; NaN of a single one."""
-    return (min(figures), max(figures)) if len(figures) > 1 else (math.nan, math.nan)
+    return ranged(float(np.median(ours) / np.median(theirs)), extremes(ratios), 2, " x")
 
 
 def main(arguments: Sequence[str]) -> None:

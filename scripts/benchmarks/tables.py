@@ -121,6 +121,11 @@ def ranged(value: float, bounds: tuple[float, float], digits: int, unit: str = "
     return text if math.isnan(bounds[0]) else f"{text} ({bounds[0]:.{digits}f} to {bounds[1]:.{digits}f})"
 
 
+def extremes(figures: Sequence[float]) -> tuple[float, float]:
+    """The least and the most, for `ranged`; NaN of a single one."""
+    return (min(figures), max(figures)) if len(figures) > 1 else (math.nan, math.nan)
+
+
 def code(name: object) -> str:
     """As code in Markdown."""
     return f"`{name}`"

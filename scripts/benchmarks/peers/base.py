@@ -128,6 +128,11 @@ def read_colour(scene: Scene, image: str) -> Any:
     return torch.from_numpy(planes)[None].float() / 255.0
 
 
+def size_of(pixels: Any) -> tuple[int, int]:
+    """Width and height of a picture (1, C, H, W)."""
+    return int(pixels.shape[3]), int(pixels.shape[2])
+
+
 def _decoded(scene: Scene, image: str, *, colour: bool) -> Any:
     import cv2
 

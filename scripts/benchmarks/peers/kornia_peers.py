@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.errors import ConfigError
-from benchmarks.peers.base import Described, Options, Scene, read_colour, read_gray, read_weights, strongest
+from benchmarks.peers.base import Described, Options, Scene, read_colour, read_gray, read_weights, size_of, strongest
 from benchmarks.peers.matching import Peer
 
 ALIKED_ROTATED, ALIKED = "aliked-n16rot", "aliked-n16"
@@ -40,8 +40,7 @@ class Aliked(Peer):
         with torch.inference_mode():
             one = self.network(pixels)[0]
         sides = (one.keypoints.numpy(), one.keypoint_scores.numpy(), one.descriptors.numpy())
-        size_px = int(pixels.shape[3]), int(pixels.shape[2])
-        return strongest(*sides, self.options.keypoints, size_px=size_px)
+        return strongest(*sides, self.options.keypoints, size_px=size_of(pixels))
 
 
 TFEAT, HARD_TFEAT = "tfeat-liberty.params", "HardTFeat.pth"

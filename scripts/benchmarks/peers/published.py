@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.errors import ConfigError
-from benchmarks.peers.base import Described, Found, Options, Scene, found, read_colour, read_weights, strongest
+from benchmarks.peers.base import Described, Found, Options, Scene, found, read_colour, read_weights, size_of, strongest
 from benchmarks.peers.matching import Peer, magsac
 
 _LIGHTGLUE: Mapping[str, Any] = {"input_dim": 128}
@@ -43,7 +43,7 @@ class Disk(Peer):
         with torch.inference_mode():
             one = self.network(pixels, n=self.options.keypoints, pad_if_not_divisible=True)[0]
         sides = (one.keypoints.numpy(), one.detection_scores.numpy(), one.descriptors.numpy())
-        return strongest(*sides, self.options.keypoints, size_px=_size(pixels))
+        return strongest(*sides, self.options.keypoints, size_px=size_of(pixels))
 
 
 class XFeat(Peer):
@@ -67,7 +67,7 @@ class XFeat(Peer):
         with torch.inference_mode():
             one = self.network.detectAndCompute(pixels, top_k=self.options.keypoints)[0]
         # kornia states pixel i of the picture reduced to multiples of 32 px by i times the reduction.
-        size_px = _size(pixels)
+        size_px = size_of(pixels)
         off = [0.5 * (side / max(32, side // 32 * 32) - 1.0) for side in size_px]
         places = one["keypoints"].numpy().astype(np.float64) + off
         sides = (places, one["scores"].numpy(), one["descriptors"].numpy())
@@ -138,11 +138,6 @@ def _renamed(tensors: Mapping[str, Any], layers: int) -> dict[str, Any]:
             old, new = f"{part}.{layer}.", f"transformers.{layer}.{part}."
             named = {new + key[len(old) :] if key.startswith(old) else key: one for key, one in named.items()}
     return named
-
-
-def _size(pixels: Any) -> tuple[int, int]:
-    """Width and height of a picture (1, C, H, W)."""
-    return int(pixels.shape[3]), int(pixels.shape[2])
 
 
 LIGHTERGLUE = {"weights": "xfeat-lighterglue.pt", "settings": _LIGHTERGLUE}
