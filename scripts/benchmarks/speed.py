@@ -15,6 +15,9 @@ pairs, consistency, export and report.
 
 Every run is made --repeats times; figures are medians, ranges in brackets lie between the least and the most.
 
+--before CHECKOUT runs another checkout of this project beside, for instance one that `git worktree add CHECKOUT COMMIT`
+makes: chains @COMMIT.
+
 Writes OUT/speed.json and OUT/speed.md. Rows that OUT has are not made again.
 """
 
@@ -102,10 +105,13 @@ def enlarged(rendered: Path, out: Path, size: tuple[int, int]) -> Path:
 
 
 def our_chain(args: argparse.Namespace, block: Path, preset: str, folder: Path) -> Row:
-    """One whole run."""
+    """One whole run, of a preset or of `preset@commit`."""
+    preset, _, commit = preset.partition("@")
     work = folder / "work"
     shutil.rmtree(work, ignore_errors=True)
-    command = [sys.executable, "-m", "aeromatch_cli.cli", "run", preset, "--quiet", "--json"]
+    # Modules are looked for in the folder of the run first, then in PYTHONPATH, then in the environment.
+    where = ["env", "-C", str(args.before), f"PYTHONPATH={args.before}"] if commit else []
+    command = [*where, sys.executable, "-m", "aeromatch_cli.cli", "run", preset, "--quiet", "--json"]
     command += ["--images", str(block / "images"), "--poses", str(block / _POSES), "--workspace", str(work)]
     command += ["--cameras", str(block / "block.json"), "--crs", "local", "--jobs", str(args.jobs)]
     command += ["--set", f"extract.keypoints={args.keypoints}"]
@@ -226,6 +232,7 @@ def main(arguments: Sequence[str]) -> None:
     add("--chains", type=options.names, default=",".join(CHAINS), help="presets and pycolmap, comma-separated")
     add("--keypoints", type=options.positive, default=8000, help="SIFT keypoints per image, of all chains")
     add("--repeats", type=options.positive, default=2, help="runs of each chain")
+    add("--before", type=Path, metavar="CHECKOUT", help="of another state of this project, to be run beside")
     add("--keep", action="store_true", help="leave the workspaces in OUT")
     add("--seed", type=int, default=64, help="another seed gives other blocks")
     add("--jobs", type=options.positive, default=2, help="processes at a time")
@@ -233,7 +240,14 @@ def main(arguments: Sequence[str]) -> None:
     args = options.parse(parser, arguments, {"images": "6", "megapixels": "1", "keypoints": 2000, "repeats": 1})
     if len(args.images) not in (1, len(args.megapixels)):
         parser.error("--images: give one number, or one for each of --megapixels")
+    args.out = args.out.resolve()
     args.out.mkdir(parents=True, exist_ok=True)
+    if args.before is not None:
+        args.before = args.before.resolve()
+        if not (args.before / "aeromatch_cli" / "__init__.py").is_file():
+            parser.error(f"--before: {args.before} is no checkout of this project")
+        others = [f"{chain}@{stamps.commit(args.before)}" for chain in args.chains if chain != PEER]
+        args.chains = [*args.chains, *others]
     kept = args.out / "speed.json"
     rows: list[Row] = []
     for row in rows_of(args, _json(kept) if kept.is_file() else []):

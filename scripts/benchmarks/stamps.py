@@ -61,17 +61,17 @@ def said(stamp: Stamp) -> str:
     return f"Commit {stamp['commit'] or 'unknown'}, {stamp['date']}; {stamp['machine']}{trained}."
 
 
-def commit() -> str | None:
+def commit(checkout: Path = REPOSITORY) -> str | None:
     """The short hash, `+changes` where tracked files outside docs/ differ from it; None outside a repository."""
-    found = _git("rev-parse", "--short", "HEAD")
+    found = _git(checkout, "rev-parse", "--short", "HEAD")
     if not found:
         return None
-    return f"{found}+changes" if _git("status", "--porcelain", "-uno", "--", ".", ":!docs") else found
+    return f"{found}+changes" if _git(checkout, "status", "--porcelain", "-uno", "--", ".", ":!docs") else found
 
 
-def _git(*words: str) -> str:
+def _git(checkout: Path, *words: str) -> str:
     try:
-        done = subprocess.run(["git", *words], cwd=REPOSITORY, check=False, capture_output=True, text=True)
+        done = subprocess.run(["git", *words], cwd=checkout, check=False, capture_output=True, text=True)
     except OSError:
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""
