@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from aeromatch_cli.data import AdjustedBlock, Camera, PoseResidual
+from aeromatch_cli.data import AdjustedBlock, Block, Camera, Pose, PoseResidual
 from aeromatch_cli.formats.adjusted import read_adjusted, read_residuals
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.report.rows import ImageRow
@@ -57,6 +57,24 @@ def final_points(context: Context, adjustment: Adjustment) -> AdjustedBlock | No
     """The adjusted block with the points that final matches hold; None where the last adjustment found none."""
     path = context.workspace.final_or_adjusted
     return read_adjusted(path) if adjustment.found.points and path.is_file() else None
+
+
+def as_adjusted(block: Block, adjusted: AdjustedBlock | None, *, in_world: bool) -> Block:
+    """The block with adjusted poses and cameras in place of those that the first pass found: so the page shows it.
+
+    Groups of images that lie in frames of their own beside the block's have no place in it. Where the pictures' own
+    frame is another one than that of the first pass, nothing of the first pass is left.
+    """
+    if adjusted is None:
+        return block
+    found = {
+        image_id: Pose(pose.center_m, pose.rotation, math.nan, math.nan)  # standard deviations are shown elsewhere
+        for image_id, pose in adjusted.poses.items()
+        if adjusted.frames.get(image_id, 0) == (0 if in_world else 1)
+    }
+    if not in_world and not found.keys() <= block.poses.keys():
+        block = replace(block, poses={}, ground=None)
+    return replace(block, poses={**block.poses, **found}, cameras={**block.cameras, **adjusted.cameras})
 
 
 def read_position_residuals(context: Context, adjustment: Adjustment) -> dict[str, PoseResidual]:

@@ -19,7 +19,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import FloatArray, Image, Pair
+from aeromatch_cli.data import FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json
@@ -97,9 +97,15 @@ class _Found:
         seen[cells[:, 0], cells[:, 1]] = True
 
 
-def gather(context: Context, draw: Draw | None = None, spread: Mapping[str, Ninths] | None = None) -> Gathered:
+def gather(
+    context: Context,
+    draw: Draw | None = None,
+    spread: Mapping[str, Ninths] | None = None,
+    poses: Mapping[str, Pose] | None = None,
+) -> Gathered:
     """Everything about pairs and images. spread: image_id -> its ninths with a point, empty ones, points of three
-    images. Raises WorkspaceError where a file is broken."""
+    images. poses: image_id -> the pose that rows state, by default that of the context. Raises WorkspaceError where a
+    file is broken."""
     found = _Found()
     for stretch in _stretches(context, draw):
         found.add(stretch)
@@ -108,7 +114,8 @@ def gather(context: Context, draw: Draw | None = None, spread: Mapping[str, Nint
     for place, row in enumerate(pairs):
         taken, reasons = steps.get((row.image_id0, row.image_id1), ("", ""))
         pairs[place] = replace(row, steps=taken, step_reasons=reasons)
-    return Gathered(pairs, _image_rows(context, pairs, found, spread or {}), found.drawn)
+    known = context.block.poses if poses is None else poses
+    return Gathered(pairs, _image_rows(context, pairs, found, spread or {}, known), found.drawn)
 
 
 def _stretches(context: Context, draw: Draw | None) -> list[_Found]:
@@ -175,7 +182,11 @@ def _keypoints(context: Context, image_id: str) -> FloatArray | None:
 
 
 def _image_rows(
-    context: Context, pairs: Sequence[PairRow], found: _Found, spread: Mapping[str, Ninths]
+    context: Context,
+    pairs: Sequence[PairRow],
+    found: _Found,
+    spread: Mapping[str, Ninths],
+    poses: Mapping[str, Pose],
 ) -> list[ImageRow]:
     proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
     tied: Counter[str] = Counter()
@@ -198,7 +209,7 @@ def _image_rows(
                 image_id=image.image_id,
                 name=image.name,
                 href=_href(context, image),
-                pose=_pose_words(context, image),
+                pose=_pose_words(poses.get(image.image_id)),
                 keypoints=keypoints,
                 pairs=proposed[image.image_id],
                 verified_pairs=tied[image.image_id],
@@ -268,8 +279,7 @@ def _median(values: FloatArray) -> float:
     return float((ordered[(len(values) - 1) // 2] + ordered[len(values) // 2]) / 2)
 
 
-def _pose_words(context: Context, image: Image) -> str:
-    pose = context.pose(image.image_id)
+def _pose_words(pose: Pose | None) -> str:
     if pose is None:
         return "none"
     return "position" if pose.world_rotation is None else "full"

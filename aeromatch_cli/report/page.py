@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
@@ -25,6 +26,7 @@ from aeromatch_cli.report.adjustment import (
     Notice,
     adjustment_notices,
     adjustment_rows,
+    as_adjusted,
     camera_words,
     counted,
     final_points,
@@ -72,9 +74,11 @@ def run(context: Context) -> StageReport:
     report = StageReport("report", items=1, fingerprint=_told_fingerprint(context.workspace))
     results = _told_fingerprint(context.workspace, settings=False)
     adjustment = read_adjustment(context)
-    found = gather(context, pair_table, spread=adjustment.judged.spread)
+    adjusted = final_points(context, adjustment)
+    shown = as_adjusted(context.block, adjusted, in_world=adjustment.in_world)
+    found = gather(context, pair_table, adjustment.judged.spread, shown.poses)
     with settled():
-        page = render(context, found, adjustment)
+        page = render(context, found, adjustment, adjusted)
     write_text(context.workspace.report, page)
     report.record_files(context, (p for p in context.workspace.report.parent.rglob("*") if p.is_file()))
     report.done = 1
@@ -107,8 +111,8 @@ def _told_fingerprint(workspace: Workspace, *, settings: bool = True) -> str:
     return fingerprint([(path.name, file_digest(path)) for path in sorted(told) if path.is_file()])
 
 
-def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
-    """The page as text."""
+def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: AdjustedBlock | None = None) -> str:
+    """The page as text. adjusted: the adjusted block with its final points."""
     pairs, images = found.pairs, found.images
     judged = (row for row in pairs if row.state != NOT_JUDGED)
     links = connection(context, ((row.image_id0, row.image_id1, row.state, row.verified) for row in judged))
@@ -120,7 +124,8 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
     failures = failure_rows(context)
     stages = stage_rows(context.workspace)
     # Without a verified pair what is on file is of other keypoints.
-    adjusted = final_points(context, adjustment) if any(row.state == "verified" for row in pairs) else None
+    adjusted = adjusted if any(row.state == "verified" for row in pairs) else None
+    placed = replace(context, block=as_adjusted(context.block, adjusted, in_world=adjustment.in_world))
     quality = _quality(context, adjustment)
     shown = _worst_pairs(pairs)
     pictures = thumbnails(context)
@@ -157,8 +162,8 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         residuals=surveyed_rows(control),
         residuals_after_fit=control is not None and control.transformation is not None,
         block=_block_facts(context, in_world=adjustment.in_world),
-        map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),
-        fields=_ground_figures(context, adjusted, in_world=adjustment.in_world),
+        map=_map(placed, images, pairs, wrong, pictures, in_world=adjustment.in_world),
+        fields=_ground_figures(placed, adjusted, in_world=adjustment.in_world),
         histograms=[*_histograms(images, pairs), *point_figures(adjusted)],
         evaluation=evaluation_figures(context.workspace),
         previews=previews(context, pairs),
@@ -309,8 +314,8 @@ def notices(
         title = counted(len(items), "image is weakly tied", "images are weakly tied")
         found.append(Notice("bad", title, text, items))
     for pose, lacks, text in (
-        ("none", "no position", "Paired by name or time, and not on the map."),
-        ("position", "no usable attitude", "Paired by position, and drawn without footprint."),
+        ("none", "no position", "They are paired by name, time or looks, and are not on the map."),
+        ("position", "no usable attitude", "They are paired by position, and drawn without footprint."),
     ):
         items = tuple(row.name for row in images if row.pose == pose)
         if items:
