@@ -23,7 +23,7 @@ CONDITIONS: Mapping[str, tuple[str, ...]] = {
     "one sun": ("suburb:nadir", "city:nadir"),
     "two suns": ("city:mixed", "suburb:two-flights"),
     "two exposures": (f"suburb:{EXPOSED}", f"city:{EXPOSED}"),
-    "five cameras": ("city:oblique", "suburb:oblique"),
+    "five cameras": ("city:oblique",),
     "texture-poor": ("grass:nadir", "desert:nadir", "farmland:nadir"),
     "rows and facades": ("farmland:nadir", "city:nadir", "city:oblique"),
 }

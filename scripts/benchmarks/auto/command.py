@@ -39,19 +39,17 @@ from benchmarks.processes import limit_threads
 from benchmarks.tables import Row, write_rows
 
 METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
+# The conditions under which a strategy may help; both sections share the runs of `auto`.
+STRATEGY_PLACES = "city:mixed,suburb:two-flights,city:exposed,city:oblique,grass:nadir"
 STRATEGIES = "filter=epipolar+graph,filter=clustered-ransac+epipolar,match=lightglue,enhance=shadow,simulate=neighbours"
 
 
 def _rendered(section: str, arguments: Sequence[str]) -> None:
     parser = options.make_parser(f"auto {section}", __doc__)
     add = parser.add_argument
-    add("--places", type=options.names, default=",".join(PLACES), metavar="SCENE:FLIGHT", help="comma-separated")
-    add(
-        "--seeds",
-        type=options.numbers,
-        default="1,2" if section == "rendered" else "1",
-        help="of the blocks, comma-separated",
-    )
+    places = ",".join(PLACES) if section == "rendered" else STRATEGY_PLACES
+    add("--places", type=options.names, default=places, metavar="SCENE:FLIGHT", help="comma-separated")
+    add("--seeds", type=options.numbers, default="1,2", help="of the blocks, comma-separated")
     add("--size", metavar="WxH", default="640x480", help="of rendered images")
     add("--images", type=options.positive, default=6, help="of each rendered block, twice as many of five cameras")
     about = "SIFT descriptors per image; networks have half as many"
@@ -92,12 +90,7 @@ def _real(arguments: Sequence[str]) -> None:
     parser = options.make_parser("auto real", __doc__)
     add = parser.add_argument
     add("--data", type=Path, required=True, metavar="DIR", help="folder of blocks")
-    add(
-        "--blocks",
-        type=options.names,
-        default="ochota,lewis,seneca,caliterra,sheffield,brighton",
-        help="names, comma-separated",
-    )
+    add("--blocks", type=options.names, default="ochota,lewis,seneca,brighton", help="names, comma-separated")
     add("--thin", type=options.numbers, default="3,4", help="keep every k-th image; several k comma-separated")
     add("--given", type=options.names, default="positions,nothing", help=f"of {', '.join(real.GIVEN)}")
     add("--presets", type=split_methods, default=JUDGED, help="comma-separated")

@@ -171,7 +171,7 @@ _DEFAULTS = {
     "real": {"blocks": "seneca,ochota,lewis", "thin": "2", "cases": "reference,noise,nothing,third", "keypoints": 3000},
     "rendered": {
         "blocks": "city:nadir,grass:nadir,hills:nadir,suburb:mixed", "thin": "1",
-        "cases": "reference,noise,noisy,unoriented", "keypoints": 2000,
+        "cases": "reference,noise,noisy", "keypoints": 2000,
     },
 }  # fmt: skip
 _QUICK = {
