@@ -187,6 +187,10 @@ def test_a_touched_image_redoes_nothing(done_site):
     assert outcome.counts("extract") == (0, IMAGES, 0)
     assert outcome.counts("match") == (0, PAIRS, 0)
     assert pair_prints(done_site) == before
+    # What other settings ask for is made of the touched files.
+    outcome = done_site("run", "--set", "extract.keypoints=150")
+    assert outcome.code == 0
+    assert outcome.counts("extract") == (IMAGES, 0, 0)
 
 
 def test_an_edited_image_redoes_itself_and_its_pairs(done_site):

@@ -74,7 +74,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor, ind
         raise ConfigError("no images: give --images DIR, or block.images in the configuration")
     _check_folders(settings, workspace)
     before = read_json(workspace.block) if workspace.block.is_file() else {}
-    inputs, prints, remote = _read_inputs(settings, workspace, executor, index, before)
+    inputs, prints, touched, remote = _read_inputs(settings, workspace, executor, index, before)
     ground, source, remarks = given_ground(settings, inputs)
     control, absent = read_control(
         settings.block.gcp,
@@ -101,6 +101,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor, ind
         given=Given(
             block=block,
             image_fingerprints=prints,
+            touched=touched,
             focal_sigmas=inputs.focal_sigmas,
             likely_focals=inputs.likely_focals,
             angles=inputs.angles,
@@ -187,8 +188,9 @@ def _mask_warnings(settings: Settings, images: Sequence[Image]) -> list[str]:
 
 def _read_inputs(
     settings: Settings, workspace: Workspace, executor: Executor, index: Index, before: Mapping[str, Any]
-) -> tuple[BlockInputs, dict[str, str], dict[str, RemoteFile]]:
-    """Inputs, the fingerprint of every image by image_id, and by name those that lie elsewhere."""
+) -> tuple[BlockInputs, dict[str, str], dict[str, str], dict[str, RemoteFile]]:
+    """Inputs; by image_id the fingerprint of every image, and the present one of those that were only touched; by name
+    those that lie elsewhere."""
     given, root = settings.block, Path(settings.block.images)
     poses = "" if given.poses == "none" else given.poses
     lists = read_lists(poses, given.cameras, given.angles, given.pose_format, given.crs)
@@ -227,7 +229,8 @@ def _read_inputs(
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
     found = {image.image_id: prints[image.name] for image in inputs.images}
     places = {image.image_id: remote.get(image.name) or root / image.name for image in inputs.images}
-    return inputs, found | _of_touched(workspace, found, places, executor), remote
+    before_touched = _of_touched(workspace, found, places, executor)
+    return inputs, found | before_touched, {i: found[i] for i in before_touched}, remote
 
 
 def _of_touched(

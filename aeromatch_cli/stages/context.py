@@ -48,7 +48,8 @@ class Given:
     """Holds what was given of a block, before it was oriented.
 
     block: images, cameras, poses and ground as they were stated.
-    image_fingerprints: image_id -> fingerprint of the image file.
+    image_fingerprints: image_id -> fingerprint of the image file, which results are made of.
+    touched: image_id -> present fingerprint of a file of which nothing but its time has changed since.
     focal_sigmas: camera_id -> standard deviation of its focal length as it was stated, as a share of it.
     likely_focals: camera_id -> focal length in pixels that EXIF supports, where it contradicts the given one.
     angles: image_id -> attitude as it was given.
@@ -60,6 +61,7 @@ class Given:
 
     block: Block
     image_fingerprints: Mapping[str, str]
+    touched: Mapping[str, str] = field(default_factory=dict)
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
     likely_focals: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)

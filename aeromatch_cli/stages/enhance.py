@@ -92,7 +92,7 @@ def source_of(context: Context, image: Image) -> Source:
         sky_rotation=pose.world_rotation if sky and pose else None,
         scale=scale,
         fingerprint=fingerprint(*parts),
-        taken=context.given.image_fingerprints[image.image_id],
+        taken=context.given.touched.get(image.image_id, context.given.image_fingerprints[image.image_id]),
     )
 
 
