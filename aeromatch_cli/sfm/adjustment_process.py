@@ -90,7 +90,7 @@ def refine(folder: Path) -> None:
         group = waiting.popleft()
         free = not task["fixed"]
         observed = given if group["kind"] != "level" else given.without_positions()
-        model = _posed(work, folder, set(group["images"]), held)
+        model = _posed(work, folder, set(group["images"]))
         model = _triangulated(pycolmap, model, folder, rough=free)
         if free and group["kind"] != "given":
             parts = connected_parts(model)
@@ -107,6 +107,9 @@ def refine(folder: Path) -> None:
                 model, registered = _grown(pycolmap, model, folder, grouped - set(group["images"]))
                 grouped |= set(registered)
                 model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
+            # Poses fit the lens that they were found with: only points from both tell what fits another one.
+            for number in held:
+                set_lens(pycolmap, model.cameras[number], work.lenses[number], number in work.fisheyes)
             inside = surveyed if group["kind"] != "level" else []
             model, outcome, control = _refined(work, folder, model, group["kind"], observed, attitudes, held, inside)
         _clean(work, model, observed)
@@ -182,7 +185,7 @@ def _joined_groups(work: Work, folder: Path, groups: Sequence[dict[str, Any]]) -
     """Groups of which those that final matches tie are one; the poses on file are moved with them."""
     pycolmap, parts = work.pycolmap, []
     for group in sorted(groups, key=lambda one: (one["kind"] == "level", -len(one["images"]))):
-        posed = _posed(work, folder, set(group["images"]), held=())
+        posed = _posed(work, folder, set(group["images"]))
         model = _triangulated(pycolmap, posed, folder, rough=True)
         parts.append(_part(group["kind"], model))
     with pycolmap.Database.open(folder / "database.db") as opened:
@@ -260,15 +263,13 @@ def _refined(
     return model, outcome, control
 
 
-def _posed(work: Work, folder: Path, numbers: set[int], held: Collection[int]) -> Any:
-    """Return a model of the given poses of some images. held: cameras whose lens has been found before."""
+def _posed(work: Work, folder: Path, numbers: set[int]) -> Any:
+    """Return a model of the poses that some images have been given, and of the lenses that they were found with."""
     model = work.pycolmap.Reconstruction(folder / "sparse")
     work.start(model)
     for image in list(model.images.values()):
         if image.has_pose and image.image_id not in numbers:
             model.deregister_frame(image.frame_id)
-    for number in held:
-        set_lens(work.pycolmap, model.cameras[number], work.lenses[number], number in work.fisheyes)
     return model
 
 
