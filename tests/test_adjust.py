@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 from test_export_colmap import CAMERA_A, CAMERA_B, ORIGIN_M, Truth, make_truth
 
 from aeromatch_cli.config import load
-from aeromatch_cli.data import AdjustedBlock, FloatArray, Pose
+from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Pose
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.geometry.cameras import normalise, project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, to_omega_phi_kappa
 from aeromatch_cli.lab.synthetic import load_truth
 from aeromatch_cli.sfm import process
@@ -281,6 +281,43 @@ def test_groups_share_their_cameras(truth: Truth) -> None:
             seen_px = project(camera, pose.rotation, pose.center_m, adjusted.points_m[track[:, 1]])
             off_px.append(np.linalg.norm(seen_px - keypoints[image_id][track[:, 0]], axis=1))
         assert float(np.concatenate(off_px).mean()) == pytest.approx(figure.reprojection_error_px, rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_further_group_keeps_its_points_where_the_first_has_found_another_lens(truth: Truth) -> None:
+    """Strips there and back, oriented with a principal point 20 px off, and attitudes that make up for it: beside the
+    lens that the first group finds they are 40 px off each other."""
+    centred = Camera("PINHOLE", 1000, 750, (820.0, 820.0, 499.5, 374.5))
+    tilt = Rotation.from_euler("y", np.rad2deg(np.arctan2(20.0, 820.0)), degrees=True).as_matrix()
+    turns = {i: np.diag([(-1.0) ** n, (-1.0) ** n, 1.0]) for n, i in enumerate(IMAGE_IDS)}
+    far = {i: f"far{i[-1]}" for i in IMAGE_IDS[:3]}
+    rng, keypoints, poses = np.random.default_rng(5), {}, {}
+    for i, pose in truth.block.poses.items():
+        rays = np.column_stack([normalise(CAMERAS[i], truth.keypoints_px[i]), np.ones(len(truth.keypoints_px[i]))])
+        turned = rays @ turns[i].T
+        seen_px = 820.0 * turned[:, :2] / turned[:, 2:] + [519.5, 374.5]
+        for image_id in (i, *([far[i]] if i in far else [])):
+            keypoints[image_id] = (seen_px + rng.normal(0.0, NOISE_PX, seen_px.shape)).astype(np.float32)
+            poses[image_id] = replace(pose, world_rotation=tilt @ turns[i] @ pose.world_rotation)
+    images = [replace(image, width_px=1000, height_px=750, camera_id="a") for image in truth.block.images]
+    images += [
+        replace(one, image_id=far[one.image_id], name=f"far/{one.name}") for one in images if one.image_id in far
+    ]
+    block = replace(truth.block, images=tuple(images), cameras={"a": centred}, poses=poses)
+    more = [
+        replace(p, pair=replace(p.pair, image_id0=far[p.pair.image_id0], image_id1=far[p.pair.image_id1]))
+        for p in truth.pairs
+        if {p.pair.image_id0, p.pair.image_id1} <= far.keys()
+    ]
+    given = {i: Pose(poses[i].center_m, None, 0.1, 180.0) for i in IMAGE_IDS}
+    groups = [Group("positions", IMAGE_IDS), Group("level", tuple(far.values()))]
+    contents = ExportContents(block, keypoints.__getitem__, (*truth.pairs, *more))
+    adjusted, figures = adjust_block(contents, Observed(given, {"a": 0.02}, {}), groups, fixed=False)
+    ahead = project(adjusted.cameras["a"], np.eye(3), np.zeros(3), np.array([[0.0, 0.0, 1.0]]))
+    assert ahead[0, 0] == pytest.approx(519.5, abs=1.0)
+    assert [one.images for one in figures] == [6, 3]
+    assert figures[1].points > 150
+    assert figures[1].track_length == 3.0
 
 
 @pytest.mark.slow
