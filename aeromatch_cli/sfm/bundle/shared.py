@@ -12,8 +12,9 @@ from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.sfm.bundle.network import READOUT, Network, Unknowns
 from aeromatch_cli.sfm.bundle.solve import solve
 
-# A flight with fewer images or image points tells nothing of its lens.
-_FEWEST_IMAGES, _FEWEST_POINTS = 4, 500
+# A flight with fewer images or image points tells nothing of its lens: four of one heading (8 images of sheffield) take
+# the tilt of the block for the lens' centre.
+_FEWEST_IMAGES, _FEWEST_POINTS = 6, 500
 # A lens of its own is another one where it lowers the sum of squares by so much for each of its unknowns. By chance it
 # is 1; errors of real matches have causes in common, and halves of one flight reach 9 (seneca, every third image).
 _WORTH_SQUARES = 15.0
