@@ -109,7 +109,7 @@ def test_pictures_beside_the_page_are_made_once_and_stale_files_go(large: Contex
 def test_images_beyond_the_guard_of_pillow_have_thumbnails(full: Context, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     """Pillow refuses more than twice so many pixels; cameras for mapping have frames of 300 megapixels."""
     monkeypatch.setattr(PilImage, "MAX_IMAGE_PIXELS", 100)
-    assert thumbnails._small(full.image_path(full.block.images[1]), 32).shape[1] <= 32
+    assert thumbnails.small_raster(full.image_path(full.block.images[1]), 32).shape[1] <= 32
 
 
 def test_a_thumbnail_is_the_raster_as_stored(full: Context) -> None:  # noqa: F811

@@ -115,15 +115,20 @@ def without_frames(pixels: NDArray[Any]) -> BoolArray | None:
     """
     import cv2
 
-    flat = pixels if pixels.ndim == 2 else pixels.max(axis=2)
-    borders = (flat[0], flat[-1], flat[:, 0], flat[:, -1])
-    if all(np.count_nonzero(line == 0) < 0.5 * line.size for line in borders):
+    height, width = pixels.shape[:2]
+    bands = pixels.reshape(height, width, -1)
+    if all(2 * np.count_nonzero((line == 0).all(axis=1)) < len(line) for line in _border_lines(bands)):
         return None
     # With one more black pixel all around, all frames are what hangs together with the first corner.
-    black = np.ones((flat.shape[0] + 2, flat.shape[1] + 2), np.uint8)
-    np.equal(flat, 0, out=black[1:-1, 1:-1], casting="unsafe")
+    black = np.ones((height + 2, width + 2), np.uint8)
+    np.equal(bands.max(axis=2), 0, out=black[1:-1, 1:-1], casting="unsafe")
     cv2.floodFill(black, None, (0, 0), 2, flags=4)
     return np.asarray(black[1:-1, 1:-1] != 2)
+
+
+def _border_lines(bands: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """The pixels (L, C) of each border of a picture (H, W, C)."""
+    return bands[0], bands[-1], bands[:, 0], bands[:, -1]
 
 
 def both_valid(first: BoolArray | None, second: BoolArray | None) -> BoolArray | None:

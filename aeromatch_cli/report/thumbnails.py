@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,8 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import write_atomically
-from aeromatch_cli.images.files import JPEG_SUFFIXES, check_size, read_pixels
 from aeromatch_cli.images.remote import RemoteFile, on_disk
-from aeromatch_cli.images.scaling import shrink
-from aeromatch_cli.report.previews import data_uri, jpeg, to_colour8, turned
+from aeromatch_cli.report.previews import data_uri, jpeg, small_raster, turned
 from aeromatch_cli.report.stretches import made_of, stretches
 from aeromatch_cli.stages.context import Context
 
@@ -158,23 +155,5 @@ def _known(file: Path, exif_orientation: int) -> _Thumbnail | None:
 
 
 def _encoded(path: Path, side_px: int, exif_orientation: int) -> _Thumbnail:
-    shown = turned(_small(path, side_px), exif_orientation)
+    shown = turned(small_raster(path, side_px), exif_orientation)
     return _Thumbnail(jpeg(shown, _QUALITY), shown.shape[1], shown.shape[0], exif_orientation)
-
-
-def _small(path: Path, side_px: int) -> NDArray[np.uint8]:
-    """The stored raster, reduced. A JPEG is decoded at reduced size: a tenth of the time."""
-    if path.suffix.lower() in JPEG_SUFFIXES:
-        from PIL import Image as PilImage
-
-        check_size(path)
-        try:
-            with PilImage.open(path) as picture:
-                if picture.mode in ("RGB", "L"):
-                    picture.draft(picture.mode, (side_px, side_px))
-                    picture.thumbnail((side_px, side_px), reducing_gap=2.0)
-                    return np.asarray(picture)
-        except (OSError, ValueError) as error:
-            raise ItemError(f"{path}: {error}") from error
-    pixels: NDArray[Any] = read_pixels(path, colour=True)
-    return to_colour8(shrink(pixels, min(1.0, side_px / max(pixels.shape[:2]))))

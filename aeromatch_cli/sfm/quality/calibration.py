@@ -159,8 +159,8 @@ def _flight_lenses(camera_id: str, camera: Calibration) -> Iterator[Finding]:
         if level_of(one.worth, _FLIGHT_LENS) == "good":
             words = f"camera {camera_id} has the same calibration in {flight_words(one.flight)} as in the largest"
         remedy = (
-            "was it focused, zoomed or exchanged in between? with the images of each flight in a folder of their own and "
-            "`--cameras folder` each flight has a camera of its own"
+            "was it focused, zoomed or exchanged in between? with the images of each flight in a folder of their own "
+            "and `--cameras folder` each flight has a camera of its own"
         )
         yield finding_of("flights of a camera", one.worth, _FLIGHT_LENS, words, remedy)
 
