@@ -301,3 +301,16 @@ def test_torch_is_loaded_for_many_products_alone(monkeypatch: pytest.MonkeyPatch
     assert asked == [capable and number * pair > 1_000_000_000 for number in range(1, 21)]
     monkeypatch.setitem(sys.modules, "torch", torch)
     assert scan._worth_torch(1)
+
+
+def test_torch_is_loaded_at_once_where_many_pairs_are_expected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """8,000 descriptors an image: 64 million products a pair, a billion after the 16th."""
+    monkeypatch.setattr(scan, "_may_multiply_bytes", lambda: True)
+    monkeypatch.setattr(scan, "_WORK", scan._Work())
+    monkeypatch.delitem(sys.modules, "torch", raising=False)
+    assert [scan._worth_torch(64_000_000) for _ in range(16)] == [False] * 15 + [True]
+    scan._WORK.products = 0
+    scan.expect_comparisons(15)
+    assert not scan._worth_torch(64_000_000)
+    scan.expect_comparisons(16)
+    assert scan._worth_torch(64_000_000)

@@ -25,13 +25,15 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.store.block_store import KnownMatches, matches_of
 from aeromatch_cli.strategies import Matcher
+from aeromatch_cli.strategies.matchers.descriptors.scan import expect_comparisons
 from aeromatch_cli.strategies.matchers.descriptors.search import Search
 from aeromatch_cli.workspace import Workspace
 
 
 @dataclass(frozen=True, eq=False)
 class MatchTask:
-    """Asks for the matches of all pairs of one image. matchers: by image_id1."""
+    """Asks for the matches of all pairs of one image. matchers: by image_id1. share: of all pairs, how many a
+    worker compares."""
 
     image_id0: str
     pairs: tuple[PairTask, ...]
@@ -40,6 +42,7 @@ class MatchTask:
     overwrite: bool
     # By image_id, for a matcher that reads pixels.
     sources: Mapping[str, Source] = field(default_factory=dict)
+    share: int = 0
 
 
 def paired_images(context: Context) -> set[str]:
@@ -57,6 +60,7 @@ def make_tasks(context: Context) -> list[MatchTask]:
     last."""
     state = BlockState.of(context)
     features, tasks = state.with_features(images_of_rows(context)), []
+    share = sum(map(len, context.rows().values())) // context.executor.jobs
     for image_id0, pairs in context.rows().items():
         usable = [p for p in pairs if p.image_id0 in features and p.image_id1 in features]
         row = tuple(
@@ -71,13 +75,14 @@ def make_tasks(context: Context) -> list[MatchTask]:
             ids = (image_id0, *(pair.image_id1 for pair in row)) if context.settings.match.reads_pixels else ()
             sources = {image_id: extract.task_of(context, image_id).views.enhance.source for image_id in ids}
             matchers = {pair.image_id1: state.matcher(pair) for pair in usable}
-            task = MatchTask(image_id0, row, matchers, context.workspace, context.scope.overwrite, sources)
+            task = MatchTask(image_id0, row, matchers, context.workspace, context.scope.overwrite, sources, share)
             tasks.append(task)
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
 
 
 def run_task(task: MatchTask) -> RowResult[KnownMatches]:
     """Match what is not up to date in one row."""
+    expect_comparisons(task.share)
     path = task.workspace.matches(task.image_id0)
     old = driver.readable(read_match_row, path, task.overwrite)
     features0 = _features(task.workspace.features(task.image_id0))

@@ -23,9 +23,9 @@ from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 # Rows of the score matrix at a time: 128 x 4000 values stay in a core's own cache for all passes over them.
 _BLOCK_ROWS = 128
 _SHIFT = 128
-# Products of descriptors that a process makes before it loads torch for integer ones: as many as take, in floating
-# point, two or three times as long as loading it (1.7 s). Those after it take a third of the time (8,000 descriptors an
-# image, one core with VNNI: 0.08 s a pair instead of 0.26).
+# So many products of descriptors, made or expected, are worth loading torch for integer ones: in floating point they
+# take two or three times as long as loading it (1.7 s), in integers a third of that (8,000 descriptors an image, one
+# core with VNNI: 0.08 s a pair instead of 0.26).
 _LOADING_PAYS = 1_000_000_000
 _COMPONENTS_EXACT = 128  # 2 x 128 x 255^2 < 2^24: up to here float32 sums of byte products are exact
 
@@ -200,18 +200,25 @@ def _integer_product(queries: NDArray[Any], targets: NDArray[Any]) -> tuple[Mult
 
 @dataclass
 class _Work:
-    """products: of descriptors that this process has made so far."""
+    """products: of descriptors that this process has made so far. comparisons: pairs that it is expected to compare."""
 
     products: int = 0
+    comparisons: int = 0
 
 
 _WORK = _Work()
 
 
+def expect_comparisons(count: int) -> None:
+    """Say how many pairs this process is likely to compare."""
+    _WORK.comparisons = count
+
+
 def _worth_torch(products: int) -> bool:
-    """Whether torch is loaded, or so many products were made that there will be more. Floating point is as exact."""
+    """Whether torch is loaded, or there are so many products that it is worth loading. Floating point is as exact."""
     _WORK.products += products
-    return "torch" in sys.modules or (_WORK.products > _LOADING_PAYS and _may_multiply_bytes())
+    most = max(_WORK.products, products * _WORK.comparisons)
+    return "torch" in sys.modules or (most > _LOADING_PAYS and _may_multiply_bytes())
 
 
 @cache
