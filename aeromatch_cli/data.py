@@ -117,6 +117,12 @@ class AdjustedBlock:
             return [self]
         return [self._part(members[k]) for k in sorted(members, key=lambda k: (k > 0, -len(members[k]), k))]
 
+    def aside(self, *, in_world: bool) -> frozenset[str]:
+        """Return the images whose place beside the first part is not known; `in_world` that in the world."""
+        first, *others = self.parts()
+        beside = frozenset(image_id for part in others for image_id in part.poses)
+        return beside.union(first.frames) if in_world else beside
+
     def _part(self, image_ids: Sequence[str]) -> AdjustedBlock:
         tracks = {i: self.tracks[i] for i in image_ids if i in self.tracks}
         seen = np.unique(np.concatenate([np.zeros(0, np.int32), *(track[:, 1] for track in tracks.values())]))

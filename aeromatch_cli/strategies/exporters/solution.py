@@ -49,9 +49,7 @@ def unplaced(contents: ExportContents) -> frozenset[str]:
     that no position has placed in it."""
     if contents.adjusted is None:
         return frozenset()
-    first, *others = contents.adjusted.parts()
-    beside = {image_id for part in others for image_id in part.poses}
-    return frozenset(beside if contents.geographic is None else beside.union(first.frames))
+    return contents.adjusted.aside(in_world=contents.geographic is not None)
 
 
 def unplaced_remark(contents: ExportContents) -> list[str]:
