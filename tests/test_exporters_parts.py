@@ -159,6 +159,10 @@ def test_opensfm_has_parts_without_crs_and_the_placed_one_with_it(
     assert own.adjusted is not None
     first, second = own.adjusted.parts()
     assert [len(part["points"]) for part in parts] == [len(first.points_m), len(second.points_m)]
+    assert "reference_lla" not in parts[0]
+    for part, image_id in zip(parts, ("img0", "img4"), strict=True):
+        pose, shot = own.adjusted.poses[image_id], part["shots"][f"{image_id[3:]}.jpg"]
+        np.testing.assert_allclose(shot["translation"], -pose.rotation @ pose.center_m, atol=1e-9)
     point = parts[1]["points"][str(int(own.adjusted.tracks["img4"][0, 1]))]
     np.testing.assert_allclose(point["coordinates"], second.points_m[second.tracks["img4"][0, 1]], atol=1e-6)
     assert (summary.posed_images, len(summary.remarks)) == (6, 1)
