@@ -6,7 +6,7 @@ top-left pixel of the stored raster.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -104,6 +104,33 @@ class AdjustedBlock:
     def observations(self) -> int:
         """Of points by images."""
         return sum(len(track) for track in self.tracks.values())
+
+    def parts(self) -> list[AdjustedBlock]:
+        """Return the block in parts that have a frame each, with the points of their images, numbered anew: first what
+        positions have placed in the world, then groups in frames of their own, the largest first; itself where it is
+        one. At least one part.
+        """
+        members: dict[int, list[str]] = {}
+        for image_id in self.poses:
+            members.setdefault(self.frames.get(image_id, 0), []).append(image_id)
+        if len(members) < 2:
+            return [self]
+        return [self._part(members[k]) for k in sorted(members, key=lambda k: (k > 0, -len(members[k]), k))]
+
+    def aside(self, *, in_world: bool) -> frozenset[str]:
+        """Return the images whose place beside the first part is not known; `in_world` that in the world."""
+        first, *others = self.parts()
+        beside = frozenset(image_id for part in others for image_id in part.poses)
+        return beside.union(first.frames) if in_world else beside
+
+    def _part(self, image_ids: Sequence[str]) -> AdjustedBlock:
+        tracks = {i: self.tracks[i] for i in image_ids if i in self.tracks}
+        seen = np.unique(np.concatenate([np.zeros(0, np.int32), *(track[:, 1] for track in tracks.values())]))
+        for i, track in tracks.items():
+            tracks[i] = np.column_stack([track[:, 0], np.searchsorted(seen, track[:, 1])]).astype(np.int32)
+        poses = {i: self.poses[i] for i in image_ids}
+        frames = {i: self.frames[i] for i in image_ids if i in self.frames}
+        return AdjustedBlock(self.cameras, poses, self.points_m[seen], self.errors_px[seen], tracks, frames)
 
 
 @dataclass(frozen=True, eq=False)

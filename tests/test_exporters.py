@@ -173,32 +173,6 @@ def test_opensfm_refuses_two_images_of_one_file_name(truth: Truth, tmp_path: Pat
         EXPORTERS["opensfm"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "o")  # type: ignore[operator]
 
 
-def test_what_no_position_places_is_not_in_the_crs(contents, truth: Truth, tmp_path: Path) -> None:
-    """A group beside the others: its poses are no coordinates of the CRS."""
-    adjusted = dataclasses.replace(adjusted_block(truth), frames={"img1": 1})
-    aside = dataclasses.replace(contents(), adjusted=adjusted)
-    EXPORTERS["micmac"]()(aside, tmp_path / "m")  # type: ignore[operator]
-    written = sorted(path.name for path in (tmp_path / "m" / "Ori-aeromatch").glob("Orientation-*"))
-    assert "Orientation-flight_0.jpg.xml" in written
-    assert "Orientation-flight_1.jpg.xml" not in written
-    # Nor are its points, which other images may have measured all the same.
-    theirs = set(adjusted.tracks["img1"][:, 1].tolist())
-    assert 0 < len(theirs) < len(adjusted.points_m)
-    EXPORTERS["tracks"]()(aside, tmp_path / "t")  # type: ignore[operator]
-    with (tmp_path / "t" / "tracks.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert {int(row["track"]) for row in rows if not row["x_m"]} == theirs
-    EXPORTERS["bundler"]()(aside, tmp_path / "b")  # type: ignore[operator]
-    head = (tmp_path / "b" / "bundle.out").read_text().splitlines()[1]
-    assert int(head.split()[1]) == len(adjusted.points_m) - len(theirs)
-    EXPORTERS["blocks-exchange"]()(aside, tmp_path / "x")  # type: ignore[operator]
-    assert (tmp_path / "x" / "blocks.xml").read_text().count("<Position>") == len(adjusted.points_m) - len(theirs)
-    EXPORTERS["geojson"]()(aside, tmp_path / "g")  # type: ignore[operator]
-    cameras = json.loads((tmp_path / "g" / "cameras.geojson").read_text())["features"]
-    assert "flight/1.jpg" not in {one["properties"]["image"] for one in cameras}
-    assert len(cameras) == len(truth.block.images) - 1
-
-
 @pytest.mark.parametrize("binary", [False, True])
 def test_micmac_has_both_directions(truth: Truth, tmp_path: Path, binary: bool) -> None:
     EXPORTERS["micmac"](binary=binary)(truth.contents(), tmp_path / "m")  # type: ignore[operator]

@@ -135,18 +135,6 @@ def test_positions_and_times_come_along(folder: Path, contents: ExportContents, 
     np.testing.assert_allclose(shot["gps_position"], expected, atol=1e-6)
 
 
-def test_groups_of_a_local_block_are_parts_of_their_own(contents: ExportContents, truth: Truth, tmp_path: Path) -> None:
-    adjusted = dataclasses.replace(adjusted_block(truth), frames={"img4": 1, "img5": 1})
-    local = dataclasses.replace(contents, geographic=None, adjusted=adjusted)
-    EXPORTERS["opensfm"]()(local, tmp_path / "o")  # type: ignore[operator]
-    first, second = json.loads((tmp_path / "o" / "reconstruction.json").read_text())
-    assert sorted(second["shots"]) == ["4.jpg", "5.jpg"]
-    assert len(first["shots"]) == 4
-    assert "reference_lla" not in first
-    pose, shot = truth.block.poses["img0"], first["shots"]["0.jpg"]
-    np.testing.assert_allclose(shot["translation"], -np.asarray(pose.world_rotation) @ pose.center_m, atol=1e-9)
-
-
 def test_a_block_that_is_not_adjusted_has_no_reconstruction(truth: Truth, tmp_path: Path) -> None:
     EXPORTERS["opensfm"]()(truth.contents(), tmp_path / "o")  # type: ignore[operator]
     assert not (tmp_path / "o" / "reconstruction.json").exists()

@@ -16,7 +16,7 @@ from read_html import Structure, shapes
 
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.config import Settings, load
-from aeromatch_cli.data import Block, Camera, Features, Image, Matches, Pair, Pose, Verdict
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, Features, Image, Matches, Pair, Pose, Verdict
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import write_atomically, write_json
@@ -283,6 +283,25 @@ def test_every_figure_of_the_page_is_well_formed_and_the_map_shows_the_poses(ful
     ((title, line),) = shapes(block_map, "rejected")
     assert title == f"a.png – {NASTY}: rejected: 8 inliers of 12 matches"
     np.testing.assert_allclose(np.reshape(line, (2, 2)), [a, c], atol=0.11)
+
+
+@pytest.mark.parametrize(
+    ("frames", "in_world", "shown"), [({"c": 1}, True, "abd"), ({"a": 1, "b": 1, "c": 2}, False, "ab")]
+)
+def test_images_of_other_groups_have_no_place_on_the_map(full, frames, in_world, shown):
+    """a and b are tied to each other, c to neither; d is not oriented, but has a position in the world."""
+    poses = {i: AdjustedPose(full.block.poses[i].center_m, LOOKING_DOWN, *np.zeros((2, 3))) for i in "abc"}
+    tracks = {i: np.column_stack([np.arange(30), np.arange(30) + 30 * (i == "c")]).astype(np.int32) for i in "abc"}
+    points_m = np.zeros((60, 3))
+    adjusted = AdjustedBlock(full.block.cameras, poses, points_m, np.zeros(60), tracks, frames)
+    page = report.render(full, gather(full, pair_table), Adjustment(in_world=in_world), adjusted)
+    assert "Not drawn: 1 image of other groups, whose place beside the first is not known." in page
+    (block_map,) = (svg for svg in re.findall(r"<svg.*?</svg>", page, re.S) if 'aria-label="Block map"' in svg)
+    cameras = [title for kind in ("fine", "weak", "wrong") for title, _ in shapes(block_map, kind)]
+    names = {image.image_id: image.name for image in full.block.images}
+    assert sorted(title.split(": ")[0] for title in cameras) == sorted(names[i] for i in shown)
+    assert ("metres" in block_map, "arbitrary units" in block_map) == (in_world, not in_world)
+    assert "The other groups of images are left out." in page
 
 
 def test_previews_are_best_worst_and_rejected_and_missing_files_are_noted(full):

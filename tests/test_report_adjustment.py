@@ -10,7 +10,7 @@ from test_report import full, page_of  # noqa: F401
 
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, Pose
-from aeromatch_cli.report.adjustment import Adjustment, adjustment_notices, adjustment_rows, as_adjusted
+from aeromatch_cli.report.adjustment import Adjustment, adjusted_poses, adjustment_notices, adjustment_rows, as_adjusted
 from aeromatch_cli.results.stages import AdjustResult, OrientResult
 from aeromatch_cli.sfm.block_figures import block_figures
 from aeromatch_cli.stages.stage_report import StageReport
@@ -53,19 +53,23 @@ def test_a_frame_of_its_own_has_no_metres(full):  # noqa: F811
 
 def test_the_page_shows_the_block_as_it_was_adjusted():
     """Image b was left out by the first pass; c has a group of its own, whose frame is none of the block's."""
-    block = Block(
-        (), {}, {"a": pose(1.0), "c": pose(3.0)}, "local", (0.0, 0.0, 0.0), ConstantGround(0.0), "stated", 0.1
-    )
+    given = {"a": pose(1.0), "c": pose(3.0), "d": pose(4.0)}
+    block = Block((), {}, given, "local", (0.0, 0.0, 0.0), ConstantGround(0.0), "stated", 0.1)
     adjusted = replace(AdjustedBlock.empty(), poses={i: moved(10.0 + k) for k, i in enumerate("abc")}, frames={"c": 1})
     shown = as_adjusted(block, adjusted, in_world=True)
-    assert {i: one.center_m[0] for i, one in shown.poses.items()} == {"a": 10.0, "b": 11.0, "c": 3.0}
+    assert {i: one.center_m[0] for i, one in shown.poses.items()} == {"a": 10.0, "b": 11.0, "d": 4.0}
     assert shown.ground is block.ground
     own = as_adjusted(block, replace(adjusted, frames={"a": 1, "b": 1, "c": 2}), in_world=False)
     assert {i: one.center_m[0] for i, one in own.poses.items()} == {"a": 10.0, "b": 11.0}
     assert own.ground is None
-    held = as_adjusted(block, replace(adjusted, frames={"a": 1, "b": 2, "c": 2}), in_world=False)
-    assert {i: one.center_m[0] for i, one in held.poses.items()} == {"a": 10.0, "c": 3.0}
+    # The largest group counts. Whether d belongs to it is not known.
+    held = as_adjusted(block, replace(adjusted, frames={"a": 2, "b": 1, "c": 2}), in_world=False)
+    assert {i: one.center_m[0] for i, one in held.poses.items()} == {"a": 10.0, "c": 12.0}
     assert held.ground is block.ground
+    alone = replace(adjusted, poses={i: adjusted.poses[i] for i in "ac"}, frames={"a": 1, "c": 1})
+    one = as_adjusted(block, alone, in_world=False)
+    assert {i: one.center_m[0] for i, one in one.poses.items()} == {"a": 10.0, "c": 12.0, "d": 4.0}
+    assert {i: one.center_m[0] for i, one in adjusted_poses(adjusted).items()} == {"a": 10.0, "b": 11.0, "c": 12.0}
 
 
 def test_cameras_count_from_the_corner_of_the_first_pixel_in_files_and_on_the_page():

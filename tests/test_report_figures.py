@@ -106,6 +106,18 @@ def test_map_is_true_to_scale_north_up_and_coloured_by_matches():
     assert figure.remarks == ("Not drawn: 1 pair has an image without position.",)
 
 
+def test_map_names_the_images_of_other_groups():
+    """c and d hang together in a frame of their own; where e lies is not known at all."""
+    stations = [report_map.Station(name, name, name, 100.0 * k, 0.0) for k, name in enumerate("ab")]
+    links = [report_map.Link(*ends, "verified", 20, "") for ends in ("ab", "cd", "ae", "ce")]
+    figure = report_map.block_map(stations, [], links, in_world=False, aside=frozenset("cd"))
+    assert figure.remarks == (
+        "Not drawn: 2 images of other groups, whose place beside the first is not known.",
+        "Not drawn: 2 pairs have images without position.",
+    )
+    assert len(shapes(figure.svg, "k0")) == 1
+
+
 def test_map_of_many_pairs_joins_its_lines_and_says_what_is_left_out(monkeypatch):
     monkeypatch.setattr(report_map, "MAX_TITLED_LINES", 5)
     monkeypatch.setattr(report_map, "MAX_LINES", 8)

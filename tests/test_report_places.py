@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose
 from aeromatch_cli.report.places import Ground, ground_figures, point_figures
 
 SQUARE = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 100.0], [0.0, 100.0]])
@@ -43,6 +43,28 @@ def test_places_that_lack_points_are_counted() -> None:
     assert all(svg.startswith("<svg") and "<image" in svg for svg, _ in found)
     assert ground_figures(centers, [], None) == []
     assert len(ground_figures(centers, [SQUARE], None)) == 1
+
+
+def test_points_of_other_groups_are_not_counted_beside_the_first() -> None:
+    """The points of the large group fill the western half; those of the small one would fill the eastern half."""
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(0, 50, 20000), rng.uniform(0, 100, 20000), np.zeros(20000)])
+    both = np.concatenate([points, points + np.array([50.0, 0.0, 0.0])])
+    rows = np.arange(20000)
+    tracks = {name: np.column_stack([rows, rows + 20000 * (name > "c")]) for name in "abcde"}
+    pose = AdjustedPose(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    frames = {name: 1 + (name > "c") for name in "abcde"}
+    adjusted = AdjustedBlock({}, dict.fromkeys("abcde", pose), both, np.zeros(40000), tracks, frames)
+    centers = np.array([[40.0, 50.0], [50.0, 50.0], [60.0, 50.0]])
+    with_others = ground_figures(centers, [SQUARE] * 3, adjusted)
+    alone = ground_figures(centers, [SQUARE] * 3, adjusted.parts()[0])
+    assert [figure for figure, _ in with_others] == [figure for figure, _ in alone]
+    assert [words.removesuffix(" The other groups of images are left out.") for _, words in with_others] == [
+        words for _, words in alone
+    ]
+    share = re.search(r"\((\d+) %\)", alone[1][1])
+    assert share is not None
+    assert 45 <= int(share[1]) <= 55
 
 
 def test_points_are_counted_by_the_images_that_see_them_and_by_their_error() -> None:

@@ -286,6 +286,12 @@ line per pair), `conditions.csv`, plots as PNG.
 their tracks; without orientation the given poses alone. The pose priors of the database are the given positions.
 `orientation.csv`, `residuals.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here
 plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
+
+Groups of images whose place beside each other is not known are models of their own. `sparse/` holds what positions have
+placed in the world, else the largest group; `sparse_own2/` is the model of the images with the frame `own 2` in
+`orientation.csv`, with a `world.json` of its own, since it lies in no CRS. Numbers of images and cameras are those of
+the database in all models; points are numbered model by model. `frames` of the upper `world.json` lists them: `model`
+(folder), `frame` (as in `orientation.csv`), `unit`, `images` (names). Where there is one frame, it is absent.
 """
 
 

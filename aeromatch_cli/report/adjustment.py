@@ -59,22 +59,31 @@ def final_points(context: Context, adjustment: Adjustment) -> AdjustedBlock | No
     return read_adjusted(path) if adjustment.found.points and path.is_file() else None
 
 
+def adjusted_poses(adjusted: AdjustedBlock | None) -> dict[str, Pose]:
+    """Poses of all adjusted images, by image_id, each in the frame of its group."""
+    if adjusted is None:
+        return {}
+    # Standard deviations are shown elsewhere.
+    return {i: Pose(pose.center_m, pose.rotation, math.nan, math.nan) for i, pose in adjusted.poses.items()}
+
+
 def as_adjusted(block: Block, adjusted: AdjustedBlock | None, *, in_world: bool) -> Block:
     """The block with adjusted poses and cameras in place of those that the first pass found: so the page shows it.
 
-    Groups of images that lie in frames of their own beside the block's have no place in it. Where the pictures' own
-    frame is another one than that of the first pass, nothing of the first pass is left.
+    Groups of images that lie in frames of their own beside that of the first part have no place in it. Where the
+    pictures' own frame is another one than that of the first pass, or the first pass may have had several, nothing of
+    the first pass is left.
     """
     if adjusted is None:
         return block
-    found = {
-        image_id: Pose(pose.center_m, pose.rotation, math.nan, math.nan)  # standard deviations are shown elsewhere
-        for image_id, pose in adjusted.poses.items()
-        if adjusted.frames.get(image_id, 0) == (0 if in_world else 1)
-    }
-    if not in_world and not found.keys() <= block.poses.keys():
-        block = replace(block, poses={}, ground=None)
-    return replace(block, poses={**block.poses, **found}, cameras={**block.cameras, **adjusted.cameras})
+    aside = adjusted.aside(in_world=in_world)
+    found = {i: pose for i, pose in adjusted_poses(adjusted).items() if i not in aside}
+    held = in_world or found.keys() <= block.poses.keys()
+    known = {i: pose for i, pose in block.poses.items() if i not in aside} if in_world or (held and not aside) else {}
+    return replace(
+        block, poses={**known, **found}, cameras={**block.cameras, **adjusted.cameras},
+        ground=block.ground if held else None,
+    )  # fmt: skip
 
 
 def read_position_residuals(context: Context, adjustment: Adjustment) -> dict[str, PoseResidual]:

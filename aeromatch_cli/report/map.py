@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,19 +102,24 @@ def block_map(
     links: Sequence[Link],
     *,
     in_world: bool = True,
+    aside: Set[str] = frozenset(),
     sketch: Sketch | None = None,
 ) -> MapFigure:
     """Footprints, pairs and cameras in world metres. footprints: polygons (N, 2). At least one station.
 
-    in_world: else in a frame of the pictures' own, where neither north nor a metre is known. sketch: what the ground
-    looks like, of two corners of the map.
+    in_world: else in a frame of the pictures' own, where neither north nor a metre is known. aside: images of groups
+    that lie in frames of their own. sketch: what the ground looks like, of two corners of the map.
     """
     place = {s.image_id: (s.x_m, s.y_m) for s in stations}
     placed = [link for link in links if link.image_id0 in place and link.image_id1 in place]
     drawn = [placed[i] for i in evenly_chosen(len(placed), MAX_LINES)]
     outlines = [footprints[i] for i in evenly_chosen(len(footprints), MAX_FOOTPRINTS)]
     remarks = [*_of_all(drawn, placed, "pair lines"), *_of_all(outlines, footprints, "footprints")]
-    if missing := len(links) - len(placed):
+    if aside:
+        words = "1 image" if len(aside) == 1 else f"{len(aside):,} images"
+        remarks.append(f"Not drawn: {words} of other groups, whose place beside the first is not known.")
+    known = place.keys() | aside
+    if missing := sum(not {link.image_id0, link.image_id1} <= known for link in links):
         words = "1 pair has an image" if missing == 1 else f"{missing:,} pairs have images"
         remarks.append(f"Not drawn: {words} without position.")
     axes = _frame(stations, footprints)

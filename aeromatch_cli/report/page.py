@@ -24,6 +24,7 @@ from aeromatch_cli.report.adjustment import (
     PRINCIPAL_POINT,
     Adjustment,
     Notice,
+    adjusted_poses,
     adjustment_notices,
     adjustment_rows,
     as_adjusted,
@@ -76,7 +77,7 @@ def run(context: Context) -> StageReport:
     adjustment = read_adjustment(context)
     adjusted = final_points(context, adjustment)
     shown = as_adjusted(context.block, adjusted, in_world=adjustment.in_world)
-    found = gather(context, pair_table, adjustment.judged.spread, shown.poses)
+    found = gather(context, pair_table, adjustment.judged.spread, {**shown.poses, **adjusted_poses(adjusted)})
     with settled():
         page = render(context, found, adjustment, adjusted)
     write_text(context.workspace.report, page)
@@ -162,7 +163,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
         residuals=surveyed_rows(control),
         residuals_after_fit=control is not None and control.transformation is not None,
         block=_block_facts(context, in_world=adjustment.in_world),
-        map=_map(placed, images, pairs, wrong, pictures, in_world=adjustment.in_world),
+        map=_map(placed, images, pairs, wrong, pictures, adjusted, in_world=adjustment.in_world),
         fields=_ground_figures(placed, adjusted, in_world=adjustment.in_world),
         histograms=[*_histograms(images, pairs), *point_figures(adjusted)],
         evaluation=evaluation_figures(context.workspace),
@@ -372,6 +373,7 @@ def _map(
     pairs: Sequence[PairRow],
     wrong: Mapping[str, float],
     pictures: Mapping[str, NDArray[np.uint8]],
+    adjusted: AdjustedBlock | None,
     *,
     in_world: bool,
 ) -> MapFigure | None:
@@ -391,7 +393,9 @@ def _map(
         return None
     footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]
     sketch = partial(ground_sketch, context, pictures)
-    return block_map(stations, footprints, [_link(row) for row in pairs], in_world=in_world, sketch=sketch)
+    aside = frozenset[str]() if adjusted is None else adjusted.aside(in_world=in_world)
+    links = [_link(row) for row in pairs]
+    return block_map(stations, footprints, links, in_world=in_world, aside=aside, sketch=sketch)
 
 
 def _link(row: PairRow) -> Link:

@@ -63,8 +63,9 @@ class Ground:
 def ground_figures(
     centers_m: FloatArray, footprints: Sequence[FloatArray], adjusted: AdjustedBlock | None, *, in_world: bool = True
 ) -> list[tuple[str, str]]:
-    """(SVG, remark) of the overlap count and, of an adjusted block, of its points per place. centers_m: (N, 2).
-    in_world: else in a frame of the pictures' own."""
+    """(SVG, remark) of the overlap count and, of an adjusted block, of its points per place. centers_m (N, 2),
+    footprints: of the images of its first part, whose points alone have a place beside them. in_world: else in a frame
+    of the pictures' own."""
     if not footprints or not len(centers_m):
         return []
     ground = Ground.of(centers_m, footprints, in_world=in_world)
@@ -74,9 +75,11 @@ def ground_figures(
     label = f"images that show a place ({_MORE_IMAGES}: or more)"
     words = f"Three images and more show {share:.0f} % of the ground."
     figures = [(_field(ground, np.minimum(count, _MORE_IMAGES), seen, label), words)]
-    if adjusted is not None and len(adjusted.points_m):
-        figures.append(_points_figure(ground, footprints, adjusted.points_m))
-    return figures
+    parts = [] if adjusted is None else adjusted.parts()
+    if parts and len(parts[0].points_m):
+        figures.append(_points_figure(ground, footprints, parts[0].points_m))
+    alone = " The other groups of images are left out." if len(parts) > 1 else ""
+    return [(figure, words + alone) for figure, words in figures]
 
 
 def _points_figure(ground: Ground, footprints: Sequence[FloatArray], points_m: FloatArray) -> tuple[str, str]:

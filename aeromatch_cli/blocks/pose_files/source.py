@@ -228,12 +228,14 @@ def numbers(where: str, cells: Sequence[str], names: Sequence[str]) -> list[floa
 
 
 def world_beside(source: Source) -> tuple[str | None, FloatArray]:
-    """CRS and origin (3,) that world.json or block.json of this program state beside a file or a folder above; None and
-    zeros where there is none, or a local frame."""
+    """CRS and origin (3,) that the first world.json or block.json of this program beside a file, or a folder above,
+    states; None and zeros where there is none, or a local frame."""
     folder = source.path if source.is_folder else source.path.parent
     for path in (folder / "world.json", folder.parent / "world.json", folder.parent / "block.json"):
         tree = Source(path).tree if path.is_file() else None
-        if isinstance(tree, dict) and isinstance(tree.get("crs"), str) and tree["crs"] != "local":
+        if isinstance(tree, dict) and isinstance(tree.get("crs"), str):
+            if tree["crs"] == "local":
+                break
             origin = np.array(tree.get("origin_m", (0.0, 0.0, 0.0)), dtype=np.float64)
             if origin.shape == (3,) and np.isfinite(origin).all():
                 return tree["crs"], origin

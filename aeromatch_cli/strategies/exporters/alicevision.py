@@ -28,7 +28,7 @@ class AliceVision(Strategy):
     """Writes cameras.sfm (views, intrinsics, poses), features/*.sift.feat, matches/0.matches.txt and world.json (CRS
     and origin that poses count from)."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     name: Literal["alicevision"] = "alicevision"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:

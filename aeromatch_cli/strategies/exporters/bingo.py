@@ -30,7 +30,7 @@ class Bingo(Strategy):
     """Writes image.txt (image points of BINGO and PATB), exterior.txt (positions and angles in gon), photos.txt (their
     numbers) and camera.txt."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["bingo"] = "bingo"
     pixel_um: float = Field(
         4.0, gt=0.0, description="Size of a pixel on the sensor, micrometres; it sets the scale of all millimetres."

@@ -36,7 +36,7 @@ _LOCAL = "local"
 class BlocksExchange(Strategy):
     """Writes blocks.xml: cameras, poses, and the points of the adjusted block with their measurements."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     name: Literal["blocks-exchange"] = "blocks-exchange"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:

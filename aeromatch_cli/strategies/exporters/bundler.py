@@ -37,7 +37,7 @@ class Bundler(Strategy):
     """Writes bundle.out (cameras, points of the adjusted block with their measurements), list.txt and world.json;
     coordinates are those of the block's world, the CRS less the origin that world.json names."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     name: Literal["bundler"] = "bundler"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:

@@ -1,5 +1,9 @@
 """COLMAP: a database for its mappers and a text model: the adjusted block, or the given poses without points.
 
+Groups of images whose place beside the others is not known are models of their own, in folders beside that of the first
+one: what COLMAP (`automatic_reconstructor`) finds below `sparse` it takes for all models that there are, and the first
+one lies in `sparse` itself.
+
 Translated on the way: keypoints and principal points move by +0.5 px (COLMAP's origin is the corner of the first
 pixel); image and camera ids become 1, 2, ... in the order of our sorted ids, so that id0 < id1 stays true and
 x1^T E x0 = 0 needs no transposition. Positions are the block's world: its CRS minus its origin, both repeated in
@@ -14,7 +18,7 @@ import threading
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, Literal
@@ -37,15 +41,19 @@ from aeromatch_cli.strategies.exporters.solution import Solution, held, write_wo
 # Ours (pixel centre) to COLMAP's pixel frame (corner).
 _COLMAP_FROM_PX = np.array([[1.0, 0.0, COLMAP_OFFSET_PX], [0.0, 1.0, COLMAP_OFFSET_PX], [0.0, 0.0, 1.0]])
 _NO_POINT = -1
+# Folder of the model, or of the first one.
+_SPARSE = "sparse"
 
 
 class Colmap(Strategy):
     """Writes database.db (cameras, rigs, frames, images, keypoints, matches, two-view geometries, pose priors),
     sparse/{cameras,images,points3D}.txt, world.json and, of an adjusted block, orientation.csv and residuals.csv. Where
-    an image name contains a space, which COLMAP cannot read from text, sparse holds the binary model as well.
+    an image name contains a space, which COLMAP cannot read from text, sparse holds the binary model as well. Groups of
+    images whose place beside the others is not known are models of their own: sparse_own2 has frame "own 2" of
+    orientation.csv.
     """
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["colmap"] = "colmap"
     raw_matches: bool = Field(
         True, description="Also write the matches before filtering, so that COLMAP can verify them itself."
@@ -61,14 +69,16 @@ class Colmap(Strategy):
             lenses = {k: in_colmap(camera).camera or camera for k, camera in contents.block.cameras.items()}
             counts = self._write_database(contents, lenses, ids, partial / "database.db")
             cameras, remarks = held(Solution.of(contents), "COLMAP", in_colmap)
-            posed = write_model(contents, cameras, ids, partial / "sparse")
+            models = _models(contents)
+            posed = sum(write_model(contents, part, cameras, ids, partial / name) for name, part in models.items())
+            remarks += _models_remark(models)
             if contents.adjusted is not None:
                 text = orientation_text(contents.adjusted, contents.block)
                 (partial / "orientation.csv").write_text(text, encoding="utf-8")
             if contents.residuals:
                 text = residuals_text(contents.residuals, contents.block.images)
                 (partial / "residuals.csv").write_text(text, encoding="utf-8")
-            write_world(partial, contents.block)
+            _write_worlds(partial, contents.block, models)
             names = sorted(path.relative_to(partial) for path in partial.rglob("*") if path.is_file())
         return ExportSummary(
             files=tuple(folder / name for name in names),
@@ -249,13 +259,51 @@ def import_pycolmap() -> ModuleType:
     return pycolmap
 
 
-def write_model(contents: ExportContents, cameras: Mapping[str, Camera], ids: Numbers, sparse: Path) -> int:
+def _models(contents: ExportContents) -> dict[str, AdjustedBlock | None]:
+    """Folder of every model -> its part of the adjusted block, the first part in `sparse`; None: the given poses."""
+    if contents.adjusted is None:
+        return {_SPARSE: None}
+    first, *others = contents.adjusted.parts()
+    return {_SPARSE: first, **{f"{_SPARSE}_own{_frame(part)}": part for part in others}}
+
+
+def _frame(part: AdjustedBlock) -> int:
+    """The number of the frame of its own that a part lies in, 0 in the world."""
+    return next(iter(part.frames.values()), 0)
+
+
+def _models_remark(models: Mapping[str, AdjustedBlock | None]) -> list[str]:
+    sizes = [f"{name} ({len(part.poses)} images)" for name, part in models.items() if part is not None]
+    if len(sizes) < 2:
+        return []
+    return [f"groups of images whose place beside each other is not known are models of their own: {', '.join(sizes)}"]
+
+
+def _write_worlds(folder: Path, block: Block, models: Mapping[str, AdjustedBlock | None]) -> None:
+    """world.json, with the images of every frame where there are several, and in the folder of every further model."""
+    names = {image.image_id: image.name for image in block.images}
+    frames = []
+    for model, part in models.items():
+        if part is not None and len(models) > 1:
+            frame = f"own {_frame(part)}" if part.frames else "world"
+            unit = "m" if block.metric and not part.frames else "arbitrary"
+            images = sorted(names[image_id] for image_id in part.poses)
+            frames.append({"model": model, "frame": frame, "unit": unit, "images": images})
+    write_world(folder, block, frames)
+    for name in models.keys() - {_SPARSE}:
+        write_world(folder / name, replace(block, crs="local", origin_m=(0.0, 0.0, 0.0), metric=False))
+
+
+def write_model(
+    contents: ExportContents, adjusted: AdjustedBlock | None, cameras: Mapping[str, Camera], ids: Numbers, sparse: Path
+) -> int:
     """cameras.txt, images.txt and points3D.txt in the new folder `sparse`; returns the number of images with a pose.
 
-    cameras: by camera_id, those that COLMAP can hold.
+    adjusted: the block, or the part of it that the model holds; None: the given poses. cameras: by camera_id, those
+    that COLMAP can hold.
     """
     sparse.mkdir()
-    block, adjusted = contents.block, contents.adjusted
+    block = contents.block
     posed = _posed_images(block) if adjusted is None else _adjusted_images(block, adjusted)
     (sparse / "cameras.txt").write_text(_cameras_text(cameras, ids), encoding="utf-8")
     with (sparse / "images.txt").open("w", encoding="utf-8") as stream:

@@ -26,7 +26,7 @@ class GeoJson(Strategy):
     """Writes cameras.geojson (angles, standard deviations and residuals of every image, times, counts of verified
     matches), footprints.geojson and pairs.geojson, and beside each its style for QGIS."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     name: Literal["geojson"] = "geojson"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:

@@ -31,7 +31,7 @@ class GeoPackage(Strategy):
     """Writes block.gpkg: camera positions with angles, standard deviations, residuals and times, footprints and pairs
     with their verified matches, and styles for QGIS; needs pyogrio."""
 
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
     name: Literal["geopackage"] = "geopackage"
 
     def check_images(self, images: Sequence[Image]) -> None:

@@ -25,7 +25,7 @@ class Hloc(Strategy):
     """Writes features.h5, matches.h5, pairs.txt, poses.txt (name, cam_from_world quaternion and translation) and
     world.json (CRS and origin that poses count from); needs h5py."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["hloc"] = "hloc"
 
     def check_images(self, images: Sequence[Image]) -> None:

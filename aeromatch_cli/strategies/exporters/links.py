@@ -32,9 +32,11 @@ class Links:
 
     @classmethod
     def of(cls, contents: ExportContents, solution: Solution, found: Matched) -> Links:
-        positions = {i: pose.center_m for i, pose in contents.block.poses.items()}
+        beside = unplaced(contents)
+        # In frames of their own it is not known of images without adjusted pose to which group they belong.
+        known = {} if beside and not contents.block.metric else contents.block.poses
+        positions = {i: pose.center_m for i, pose in known.items() if i not in beside}
         positions |= {i: center_m for i, (_, center_m) in solution.poses.items()}
-        positions = {i: center_m for i, center_m in positions.items() if i not in unplaced(contents)}
         ties: Counter[str] = Counter()
         for id0, id1, rows in found.pairs:
             ties.update({id0: len(rows), id1: len(rows)})
@@ -70,10 +72,12 @@ def camera_fields(contents: ExportContents, solution: Solution, links: Links) ->
 def footprint_fields(
     contents: ExportContents, solution: Solution, links: Links
 ) -> list[tuple[Footprint, dict[str, Any]]]:
-    """Footprints and their attributes, by image_id."""
+    """Footprints and their attributes, by image_id, of images that have a place."""
     images = {image.image_id: image for image in contents.block.images}
     found = []
     for image_id, footprint in sorted(block_footprints(contents.block).items()):
+        if image_id not in links.positions:
+            continue
         image = images[image_id]
         fields = {
             "image": image.name, "camera": image.camera_id, "time": image.time or None,

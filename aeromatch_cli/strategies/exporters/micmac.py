@@ -37,7 +37,7 @@ _ORI = "Ori-aeromatch"
 class MicMac(Strategy):
     """Writes Homol/ (tie points of every pair, both ways) and Ori-aeromatch/ (orientations and calibrations)."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     name: Literal["micmac"] = "micmac"
     binary: bool = Field(
         False, description="Write Homol as .dat, MicMac's default, instead of .txt (ExpTxt=1 in its commands)."

@@ -39,7 +39,7 @@ class OpenMvg(Strategy):
     world.json (CRS and origin that poses count from). It has one focal length and no skew: other cameras are written as
     the nearest ones."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     name: Literal["openmvg"] = "openmvg"
 
     def check_images(self, images: Sequence[Image]) -> None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 import gzip
 import json
 import pickle
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -61,7 +61,7 @@ class OpenSfm(Strategy):
     project, and reconstruction.json of an adjusted block, with colours; put the images beside them as `images`. OpenSfM
     calls images by their file names, without folders."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["opensfm"] = "opensfm"
 
     def check_images(self, images: Sequence[Image]) -> None:
@@ -91,11 +91,15 @@ class OpenSfm(Strategy):
             write(partial / "image_list.txt", "".join(f"images/{image.name}\n" for image in solution.images))
             write(partial / "config.yaml", _CONFIG)
             _write_metadata(partial, project)
+            posed, apart = len(solution.poses), ""
             if contents.adjusted is not None:
                 parts = reconstructions(project, found, track_colours(found, colours))
                 write(partial / "reconstruction.json", json.dumps(parts) + "\n")
+                posed = sum(len(part["shots"]) for part in parts)
+                if len(parts) > 1:
+                    apart = f"reconstruction.json has {len(parts)} parts, whose place beside each other is not known"
             keypoints = sum(map(len, places.values()))
-            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts, remarks)
+            return summary_of(folder, partial, contents, posed, keypoints, found.counts, remarks, apart)
 
 
 def _normalised(contents: ExportContents, image: Image) -> FloatArray:
@@ -235,27 +239,29 @@ def lla(place: Sequence[float]) -> dict[str, float]:
 
 
 def reconstructions(project: Project, found: Matched, colours: Colours) -> list[dict[str, Any]]:
-    """One part for the images of each frame, the block's own first. colours: RGB (T, 3) of the tracks."""
+    """One part for the images of each frame, the block's own first; of a block with a CRS that part alone, since what
+    reads the file takes all parts for places of one reference. colours: RGB (T, 3) of the tracks."""
     adjusted, solution = project.contents.adjusted, project.solution
     assert adjusted is not None
-    frames = {image_id: adjusted.frames.get(image_id, 0) for image_id in solution.poses}
-    return [
-        _part(project, found, colours, {image_id for image_id in frames if frames[image_id] == frame})
-        for frame in sorted(set(frames.values()))
-    ]
+    if project.contents.geographic is not None:
+        return [_part(project, found, colours, solution.poses)] if solution.poses else []
+    parts = ({i: (pose.rotation, pose.center_m) for i, pose in part.poses.items()} for part in adjusted.parts())
+    return [_part(project, found, colours, poses) for poses in parts]
 
 
-def _part(project: Project, found: Matched, colours: Colours, ids: Set[str]) -> dict[str, Any]:
-    solution = project.solution
-    images = [image for image in solution.images if image.image_id in ids]
-    seen = np.isin(found.image_idx, [place for place, image_id in enumerate(found.image_ids) if image_id in ids])
+def _part(
+    project: Project, found: Matched, colours: Colours, poses: Mapping[str, tuple[FloatArray, FloatArray]]
+) -> dict[str, Any]:
+    adjusted = project.contents.adjusted
+    assert adjusted is not None
+    images = [image for image in project.solution.images if image.image_id in poses]
+    seen = np.isin(found.image_idx, [place for place, image_id in enumerate(found.image_ids) if image_id in poses])
     tracks = np.unique(found.track[seen])
-    tracks = tracks[np.isfinite(found.points_m[tracks]).all(axis=1)]
-    points_m = found.points_m[tracks]
-    enu = _Frame(project, np.array([solution.poses[image.image_id][1] for image in images]), points_m)
+    tracks = tracks[np.isfinite(adjusted.points_m[tracks]).all(axis=1)]
+    points_m = adjusted.points_m[tracks]
+    enu = _Frame(project, np.array([poses[image.image_id][1] for image in images]), points_m)
     shots = {
-        project.names[image.image_id]: _shot(project, image, *enu.pose(*solution.poses[image.image_id]))
-        for image in images
+        project.names[image.image_id]: _shot(project, image, *enu.pose(*poses[image.image_id])) for image in images
     }
     places = np.round(enu.places(points_m), 6).tolist()
     points = {

@@ -36,7 +36,7 @@ class Ply(Strategy):
     """Writes points.ply (the points of the adjusted block with the colours of the pictures, how many images see each,
     and its mean reprojection error) and world.json (CRS and origin that coordinates count from)."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["ply"] = "ply"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:

@@ -23,8 +23,7 @@ class Solution:
     """Cameras and poses after adjustment, else as the block has them.
 
     images: all, sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> ((3, 3) cam_from_world, (3,)
-    centre in the world); images without attitude are absent, and of a block with a CRS those of groups that no position
-    has placed in it.
+    centre in the world); images without attitude are absent, and those that `unplaced` names.
     """
 
     images: tuple[Image, ...]
@@ -46,10 +45,23 @@ class Solution:
 
 
 def unplaced(contents: ExportContents) -> frozenset[str]:
-    """Images of a block with a CRS whose group no position has placed in it: their coordinates are not of that CRS."""
-    if contents.geographic is None or contents.adjusted is None:
+    """Images of groups whose place beside the first part of the adjusted block is not known; of a block with a CRS all
+    that no position has placed in it."""
+    if contents.adjusted is None:
         return frozenset()
-    return frozenset(contents.adjusted.frames)
+    return contents.adjusted.aside(in_world=contents.geographic is not None)
+
+
+def unplaced_remark(contents: ExportContents) -> list[str]:
+    """Return a sentence on the images that `unplaced` names, where a format leaves them out."""
+    if contents.adjusted is None or not (beside := unplaced(contents)):
+        return []
+    groups = len({contents.adjusted.frames[image_id] for image_id in beside})
+    which = "another group" if groups == 1 else f"{groups} other groups"
+    return [
+        f"{len(beside)} images of {which}, whose place beside the first is not known, have no pose and no point here: "
+        "export=colmap writes a model of each group"
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +91,7 @@ def matched(contents: ExportContents, *, adjusted_tracks: bool = False) -> Match
     """Tracks of all verified matches; two keypoints of one image in a track contradict each other and end it.
 
     adjusted_tracks: those of the adjusted block instead, where there is one, with their points; points of images that
-    are not placed in the block's CRS have no place.
+    `unplaced` names have no place.
     """
     ids = [image.image_id for image in contents.block.images]
     place = {image_id: number for number, image_id in enumerate(ids)}
@@ -167,12 +179,14 @@ def summary_of(
     keypoints: int,
     counts: Mapping[str, int],
     remarks: Iterable[str] = (),
+    apart: str = "",
 ) -> ExportSummary:
-    """partial: the scratch folder that holds the files now."""
+    """partial: the scratch folder that holds the files now. apart: where images are that `unplaced` names, empty where
+    they are left out."""
     names = sorted(path.relative_to(partial) for path in partial.rglob("*") if path.is_file())
     return ExportSummary(
         files=tuple(folder / name for name in names), images=len(contents.block.images), posed_images=posed,
-        keypoints=keypoints, remarks=tuple(remarks), **counts,
+        keypoints=keypoints, remarks=(*remarks, *([apart] if apart else unplaced_remark(contents))), **counts,
     )  # fmt: skip
 
 
@@ -198,13 +212,15 @@ def misfit_remark(camera_id: str, program: str, found: Nearest) -> list[str]:
     return [f"camera {camera_id}: {program} has no such lens model; the nearest one is written, {found.misfit}"]
 
 
-def write_world(folder: Path, block: Block) -> None:
-    """world.json: in which CRS, less which origin, coordinates count that a format has no place for."""
+def write_world(folder: Path, block: Block, frames: Sequence[Mapping[str, object]] = ()) -> None:
+    """world.json: in which CRS, less which origin, coordinates count that a format has no place for. frames: what is to
+    be said of each, where there are several."""
     world = {
         "crs": block.crs,
         "origin_m": list(block.origin_m),
         "unit": "m" if block.metric else "arbitrary",
         "note": "coordinate in crs = coordinate here + origin",
+        **({"frames": frames} if frames else {}),
     }
     write(folder / "world.json", json.dumps(world, indent=2) + "\n")
 

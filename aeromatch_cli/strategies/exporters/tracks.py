@@ -20,7 +20,7 @@ class Tracks(Strategy):
     """Writes tracks.csv: track, image, keypoint, place in the image (the middle of the first pixel is 0, 0) and, of
     an adjusted block, the point in its CRS."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["tracks"] = "tracks"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
