@@ -84,6 +84,10 @@ def test_the_table_of_poses_names_the_unit_of_each_line() -> None:
         assert [bool(row["sigma_x_m"]) for row in rows] == [unit == "m" for unit in expected]
         assert all(row["sigma_omega_deg"] for row in rows)
         assert [row["frame"] for row in rows] == ["world", "own 1", "predicted"]
+    moved = replace(block, origin_m=(500000.0, 0.0, 0.0))
+    rows = list(csv.DictReader(orientation_text(adjusted, moved).splitlines()))
+    shifts = [float(row["x"]) - block.poses[i].center_m[0] for i, row in zip("abc", rows, strict=True)]
+    assert shifts == [500000.0, 0.0, 500000.0]
 
 
 @pytest.mark.parametrize(("metric", "unit"), [(True, "m"), (False, "arbitrary")])

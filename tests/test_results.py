@@ -219,7 +219,7 @@ def test_a_stamp_has_every_fact(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "bfloat16" in made["machine"]
     assert "cores" in made["machine"]
     answers = {"rev-parse": "95a1b2c", "status": " M scripts/test"}
-    monkeypatch.setattr(stamps, "_git", lambda *words: answers[words[0]])
+    monkeypatch.setattr(stamps, "_git", lambda _, *words: answers[words[0]])
     assert stamps.commit() == "95a1b2c+changes"
     answers["status"] = ""
     assert stamps.commit() == "95a1b2c"

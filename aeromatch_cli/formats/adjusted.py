@@ -119,9 +119,10 @@ def orientation_fields(adjusted: AdjustedBlock, block: Block, image: Image) -> d
         center_m, rotation = known.center_m, known.world_rotation
     else:
         return None
-    place = [round(float(v), 4) for v in center_m + np.array(block.origin_m)]
-    angles = [np.nan] * 3 if rotation is None else [round(float(v), 6) for v in to_omega_phi_kappa(rotation)]
     metric = block.metric and not frame.startswith("own")
+    # An origin of the CRS would make places of a frame that has none look like those of a map.
+    place = [round(float(v), 4) for v in center_m + np.array(block.origin_m) * metric]
+    angles = [np.nan] * 3 if rotation is None else [round(float(v), 6) for v in to_omega_phi_kappa(rotation)]
     known_of = [metric] * 3 + [rotation is not None] * 3
     deviations = [float(f"{v:.3g}") if known else np.nan for v, known in zip(sigmas, known_of, strict=True)]
     unit = "m" if metric else "arbitrary"
