@@ -38,7 +38,7 @@ class Model:
     """Images that were oriented together, in the world frame.
 
     rotations: image_id -> (3, 3) cam_from_world; centers_m: image_id -> (3,). cameras: camera_id -> Camera as
-    calibrated. points_m: (P, 3). figures: counts, and how it was placed.
+    calibrated. points_m: (P, 3). figures: counts, and how it was placed. tied: images that hang on a single pair each.
     """
 
     rotations: Mapping[str, FloatArray]
@@ -46,10 +46,20 @@ class Model:
     cameras: Mapping[str, Camera]
     points_m: FloatArray
     figures: MappedModel
+    tied: frozenset[str] = frozenset()
 
     @property
     def kind(self) -> PlacementKind:
         return self.figures.kind
+
+    def with_tied(self, found: Mapping[str, Pose]) -> Model:
+        """Return the model with images that a pair each ties to it."""
+        rotations, centers_m = dict(self.rotations), dict(self.centers_m)
+        for image_id, pose in found.items():
+            assert pose.world_rotation is not None
+            rotations[image_id], centers_m[image_id] = pose.world_rotation, pose.center_m
+        figures = self.figures.model_copy(update={"images": len(rotations)})
+        return replace(self, rotations=rotations, centers_m=centers_m, figures=figures, tied=frozenset(found))
 
 
 @dataclass(frozen=True, eq=False)

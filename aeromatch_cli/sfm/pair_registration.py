@@ -125,12 +125,12 @@ def _on_ground(
     seen = [p for p in inside if pair.image_id0 in (p.image_id0, p.image_id1)]
     points_m = np.concatenate([np.zeros((0, 3)), *triangulated(seen, poses, cameras)])
     points_m = points_m[np.isfinite(points_m).all(axis=1)]
-    view = _relative(pair, cameras, thresholds_px)
+    view = relative_orientation(pair, cameras, thresholds_px)
     if view is None or view.rotation is None or len(points_m) < _FEWEST_NEAREST:
         return None
     assert known.world_rotation is not None
     rotation = view.rotation @ known.world_rotation
-    for direction in _directions(view.model, view.rotation, known.world_rotation):
+    for direction in directions(view.model, view.rotation, known.world_rotation):
         unit_m = Pose(known.center_m + direction, rotation, 0.0, _SIGMA_DEG)
         both = {pair.image_id0: known, pair.image_id1: unit_m}
         limits_px = {i: _SLACK * thresholds_px[i] for i in both}
@@ -195,12 +195,12 @@ def _tied(
 ) -> Pose | None:
     """Pose of the second image, None where its position or the matches contradict it."""
     assert known.world_rotation is not None
-    ends, view = (pair.image_id0, pair.image_id1), _relative(pair, cameras, thresholds_px)
+    ends, view = (pair.image_id0, pair.image_id1), relative_orientation(pair, cameras, thresholds_px)
     if view is None or view.rotation is None:
         return None
     rotation = view.rotation @ known.world_rotation
     limits_px = {i: _SLACK * thresholds_px[i] for i in ends}
-    for direction in _directions(view.model, view.rotation, known.world_rotation):
+    for direction in directions(view.model, view.rotation, known.world_rotation):
         center_m = _along(known, given[ends[1]], direction)
         if center_m is None and ends[0] in given:
             center_m = _apart(known, given[ends[0]], given[ends[1]], direction)
@@ -213,7 +213,9 @@ def _tied(
     return None
 
 
-def _relative(pair: PairPoints, cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]) -> TwoView | None:
+def relative_orientation(
+    pair: PairPoints, cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]
+) -> TwoView | None:
     """Relative orientation of a pair, None where too few of its matches agree on one."""
     ends = pair.image_id0, pair.image_id1
     geometry = PairGeometry(Pair(*ends, np.nan, np.nan, ""), cameras[ends[0]], cameras[ends[1]], None, None, None)
@@ -226,7 +228,7 @@ def _relative(pair: PairPoints, cameras: Mapping[str, Camera], thresholds_px: Ma
     return view if held else None
 
 
-def _directions(model: FloatArray, rotation: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:
+def directions(model: FloatArray, rotation: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit vectors in the world, one of them from the known centre to the other, of an essential matrix [t]x R."""
     crossed = model @ rotation.T
     t = np.array([crossed[2, 1], crossed[0, 2], crossed[1, 0]])

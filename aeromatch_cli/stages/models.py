@@ -13,6 +13,7 @@ from aeromatch_cli.sfm.earlier_datum import Before
 from aeromatch_cli.sfm.mapping import MAPPERS, Mapper, Model, map_block
 from aeromatch_cli.sfm.model_extension import grown
 from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES, only, sound_part
+from aeromatch_cli.sfm.pair_start import started_from_pair
 from aeromatch_cli.sfm.solution import FirstPassMatches, Solution, from_models
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
@@ -144,6 +145,11 @@ def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence:
             break
     block = context.block
     camera_ids = {image.image_id: image.camera_id for image in block.images}
+    if not models:
+        lenses = {image_id: block.cameras[camera_id] for image_id, camera_id in camera_ids.items()}
+        ups = {i: one.rotation[:, 2] for i, one in context.observed.angles.items()}
+        start = started_from_pair(evidence.pairs, block.poses, lenses, evidence.thresholds_px, ups)
+        return () if start is None else (start,)
     return grown(models, evidence.pairs, camera_ids, block.cameras, evidence.thresholds_px, block.poses)
 
 
