@@ -11,6 +11,7 @@ from benchmarks.claims.grounds import errors, ground, known_pair
 from benchmarks.claims.intervals import Estimate, change, column, estimate, of_sums, verdict
 from benchmarks.claims.sides import unknown_geometry
 from benchmarks.claims.work import Unit
+from benchmarks.exposure import under_exposed
 
 from aeromatch_cli.strategies.matchers.polar import Polar
 from aeromatch_cli.strategies.matchers.polar.fit import polar_grid
@@ -117,7 +118,8 @@ def test_a_start_is_as_far_off_as_asked():
 
 def test_under_exposed_shadow_is_noise():
     lit, shade, other = (
-        shadow.darkened(np.full((80, 80, 3), level, np.uint8), np.random.default_rng(level)) for level in (128, 40, 43)
+        under_exposed(np.full((80, 80, 3), level, np.uint8), 0.06, np.random.default_rng(level))
+        for level in (128, 40, 43)
     )
     # sRGB 128 is 0.2159 of full light, 40 is 0.0212: 0.06 of it is stored as 30 and 4 levels.
     assert lit.mean() == pytest.approx(30.1, abs=0.7)
