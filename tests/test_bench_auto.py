@@ -41,8 +41,8 @@ def test_every_second_picture_gets_an_eighth_of_the_light(tmp_path: Path) -> Non
     (block / "truth.json").write_text("{}")
     out = blocks.darker_block(block)
     means = [cv2.imread(str(path)).mean() for path in sorted((out / "images").iterdir())]
-    # sRGB 180 is 0.4564 of full light, an eighth of that is stored as level 67.
-    assert means == pytest.approx([180.0, 67.0, 180.0], abs=1.0)
+    # sRGB 180 is 0.4564 of full light, an eighth of that is stored as level 67.6.
+    assert means == pytest.approx([180.0, 67.6, 180.0], abs=1.0)
     assert (out / "truth.json").read_text() == "{}"
     assert blocks.darker_block(block) == out  # made once
     assert cv2.imread(str(block / "images" / "b.jpg")).mean() == pytest.approx(180.0, abs=1.0)

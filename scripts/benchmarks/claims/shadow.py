@@ -37,6 +37,7 @@ from benchmarks.tables import Row
 CODE = (*OUR_CODE, "lab/synthetic", "evaluate", "benchmarks/claims/shadow.py", "benchmarks/exposure.py")
 SCENES = ("city", "suburb")
 SIZE, IMAGES, KEYPOINTS = "800x600", 12, 2048
+# LightGlue on every pair, on all keypoints, without guided search: no pair has so many matches that it goes without.
 _MATCHER = (
     "match.guided=false,match.only_overlap=false,match.network_below_matches=100000,match.guide_below_matches=100000"
 )
@@ -49,6 +50,14 @@ ARMS: Mapping[str, str] = {
     STEP: f"fusion[{_MATCHER}]",
     WHOLE: "fusion",
     PLAIN: "fusion[enhance=none]",
+}
+ABOUT: Mapping[str, str] = {
+    PAPER: "the paper's baseline: SIFT on the images as taken, LightGlue on every pair, all keypoints, not guided",
+    SHADOW: "the same, features of pictures with enhanced shadow, too",
+    VIEWS: "the baseline on simulated views",
+    STEP: "the baseline with both",
+    WHOLE: "the preset, with guided search, and LightGlue where matches are few",
+    PLAIN: "the preset without enhancement",
 }
 # On under-exposed pictures the question is what enhancement brings.
 DARK_ARMS = (PAPER, SHADOW, WHOLE, PLAIN)
