@@ -160,4 +160,16 @@ def test_missing_attitude_is_stated() -> None:
     rotations: list[FloatArray | None] = [*TILTED[:4], None, None]
     summary = summarise(block(rotations=rotations))
     assert summary.warnings == ()
-    assert "without attitude 2: paired by position" in "\n".join(summary.lines())
+    assert "without attitude 2: paired by position" in summary.lines()
+    given = summarise(block(rotations=[*TILTED]))
+    words = "without attitude 2: those given contradict the pictures and are not used; paired by position"
+    assert words in summary.lines(given)
+
+
+def test_the_extent_is_of_images_whose_places_to_each_other_are_known() -> None:
+    found = block()
+    assert "extent           100.0 m east-west, 25.0 m north-south" in summarise(found).lines()
+    far = {"img4", "img5"}
+    moved = {i: replace(p, center_m=p.center_m + 1000.0 * (i in far)) for i, p in found.poses.items()}
+    lines = summarise(replace(found, poses=moved), apart=far).lines()
+    assert "extent           60.0 m east-west, 15.0 m north-south, of 4 images that hang together" in lines
