@@ -11,6 +11,8 @@ from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_yaw_pitch_roll
+from aeromatch_cli.sfm.mapping import Group
+from aeromatch_cli.stages.pairs import _apart
 
 CAMERA = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 ORIGIN = (333000.0, 3100000.0, 0.0)  # EPSG:32617
@@ -164,6 +166,13 @@ def test_missing_attitude_is_stated() -> None:
     given = summarise(block(rotations=[*TILTED]))
     words = "without attitude 2: those given contradict the pictures and are not used; paired by position"
     assert words in summary.lines(given)
+
+
+def test_images_are_apart_that_nothing_ties_to_the_world_or_to_the_largest_group() -> None:
+    large, small, placed = Group("level", ("a", "b", "c")), Group("level", ("d", "e")), Group("positions", ("f",))
+    assert _apart([large, small]) == {"d", "e"}
+    assert _apart([placed, large, small]) == {"a", "b", "c", "d", "e"}
+    assert _apart([large]) == _apart([placed]) == _apart([]) == set()
 
 
 def test_the_extent_is_of_images_whose_places_to_each_other_are_known() -> None:

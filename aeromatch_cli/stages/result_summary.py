@@ -42,9 +42,10 @@ def _weak(results: BlockResults, names: Mapping[str, str]) -> list[str]:
         lines.append(f"weak: {_listed(loose, names)}, with fewer than {_FEW_POINTS} points that three images see")
     empty = [i for i, ninths in spread.items() if ninths.empty]
     if empty:
+        verb = "has" if len(empty) == 1 else "have"
         lines.append(
-            f"{len(empty)} of {len(spread)} images have no point in a ninth of the picture or more whose ground other "
-            f"images show ({_listed(empty, names)}): they are tied less evenly, which does not change the verdict"
+            f"{len(empty)} of {len(spread)} images {verb} no point in a ninth of the picture or more whose ground other "
+            f"images show ({_listed(empty, names)}): less evenly tied, which does not change the verdict"
         )
     return lines
 
