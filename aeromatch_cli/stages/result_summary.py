@@ -44,8 +44,8 @@ def _weak(results: BlockResults, names: Mapping[str, str]) -> list[str]:
     if empty:
         verb = "has" if len(empty) == 1 else "have"
         lines.append(
-            f"{len(empty)} of {len(spread)} images {verb} no point in a ninth of the picture or more whose ground other "
-            f"images show ({_listed(empty, names)}): less evenly tied, which does not change the verdict"
+            f"{len(empty)} of {len(spread)} images {verb} no point in a ninth of the picture or more whose ground "
+            f"other images show ({_listed(empty, names)}): less evenly tied, which does not change the verdict"
         )
     return lines
 
