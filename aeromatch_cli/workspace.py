@@ -26,6 +26,8 @@ from aeromatch_cli.formats.reading import readable
 from aeromatch_cli.results.record import StageRecord
 
 FORMAT_VERSION = 1
+# Stages whose results exports hold.
+_EXPORTED = ("filter", "refine", "adjust", "consistency")
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,12 @@ class Workspace:
     def export_is_older(self) -> bool:
         """Whether stages before the last export have made something since."""
         made = self.stage_report("export")
-        return made.is_file() and self.ran_since(made, "filter", "refine", "adjust", "consistency")
+        return made.is_file() and self.ran_since(made, *_EXPORTED)
+
+    def is_older_export(self, folder: Path) -> bool:
+        """Whether stages before an export have made something since its folder was written, by whatever settings."""
+        times_s = [(path.stat().st_mtime, path) for path in folder.rglob("*") if path.is_file()]
+        return not times_s or self.ran_since(max(times_s)[1], *_EXPORTED)
 
     def changed_tables(self) -> list[str]:
         """Names of the tables of the block that are not as they were written, or gone. Raises as `check_version`."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Site, invoke
+from conftest import IMAGES, Site, invoke
 
 from aeromatch_cli.blocks.plausibility import warnings_of
 from aeromatch_cli.blocks.summary import summarise
@@ -119,6 +119,8 @@ def test_a_run_without_positions_says_no_metre(site: Site) -> None:
     assert lengths(stages) == {"origin_m"}  # of a frame that has none
     (group,) = stages["adjust"]["result"]["groups"]
     assert 0.0 < group["heights"]["sigma"] / group["heights"]["pixel"] < 10.0
+    oriented = stages["adjust"]["result"]["images"]
+    assert f"images      {IMAGES}, 0 with position given; {oriented} oriented\n" in invoke("show", site.work).stdout
     shown = invoke("show", site.work, site.names()[0]).stdout
     assert "units of arbitrary length" in shown
     assert not METRES.search(shown)

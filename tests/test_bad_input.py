@@ -53,6 +53,10 @@ def test_one_bad_image_never_stops_the_rest(site, how):
     assert item == bad.name
     assert bad.name in outcome.stderr
     assert bad.name.replace(".", "_") not in outcome.stderr
+    links = outcome.facts["stages"]["filter"]["result"]  # of the images that could be read
+    assert (links["components"], links["weakly_tied"], links["unconnected"]) == ([IMAGES - 1], [], [])
+    assert links["unread"] == ([bad.name] if stage == "extract" else [])
+    assert f"(1 not read): {bad.name}" in outcome.stdout
 
     before = files(site.work)
     again = site("run")  # it still fails, so it is still reported

@@ -12,6 +12,11 @@ import pytest
 from benchmarks import __main__ as launcher
 from benchmarks.auto import blocks, command, real, rendered, runs, strategies
 
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, Image
+from aeromatch_cli.formats.adjusted import write_adjusted
+from aeromatch_cli.formats.tables import images_text
+from aeromatch_cli.workspace import Workspace
+
 Row = dict[str, Any]
 
 
@@ -34,11 +39,12 @@ def test_every_second_picture_gets_an_eighth_of_the_light(tmp_path: Path) -> Non
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         cv2.imwrite(str(block / "images" / name), np.full((64, 64, 3), 180, np.uint8))
     (block / "truth.json").write_text("{}")
-    out = blocks.under_exposed(block)
+    out = blocks.darker_block(block)
     means = [cv2.imread(str(path)).mean() for path in sorted((out / "images").iterdir())]
-    assert means == pytest.approx([180.0, 180.0 * 0.125 ** (1 / 2.2), 180.0], abs=1.0)
+    # sRGB 180 is 0.4564 of full light, an eighth of that is stored as level 67.6.
+    assert means == pytest.approx([180.0, 67.6, 180.0], abs=1.0)
     assert (out / "truth.json").read_text() == "{}"
-    assert blocks.under_exposed(block) == out  # made once
+    assert blocks.darker_block(block) == out  # made once
     assert cv2.imread(str(block / "images" / "b.jpg")).mean() == pytest.approx(180.0, abs=1.0)
 
 
@@ -61,12 +67,12 @@ def test_methods_stand_beside_auto_on_the_blocks_that_they_have() -> None:
 @pytest.mark.parametrize(
     ("correct", "kept", "expected"),
     [
-        (1020, 1071, strategies.WORTH),  # 2 % more at the same share
-        (1019, 1070, strategies.NOT_WORTH),
-        (1100, 1200, strategies.NOT_WORTH),  # more, and more of them wrong
-        (990, 1030, strategies.WORTH),  # 40 instead of 50 wrong ones
-        (990, 1031, strategies.NOT_WORTH),
-        (980, 1000, strategies.NOT_WORTH),  # fewer wrong ones, 2 % fewer right ones
+        (1020, 1071, strategies.ACCEPTED),  # 2 % more at the same correctness
+        (1019, 1070, strategies.NOT_ACCEPTED),
+        (1100, 1200, strategies.NOT_ACCEPTED),  # more, and more of them wrong
+        (990, 1030, strategies.ACCEPTED),  # 40 instead of 50 wrong ones
+        (990, 1031, strategies.NOT_ACCEPTED),
+        (980, 1000, strategies.NOT_ACCEPTED),  # fewer wrong ones, 2 % fewer correct ones
     ],
 )
 def test_the_rule_for_strategies(correct: int, kept: int, expected: str) -> None:
@@ -82,24 +88,53 @@ def test_strategies_have_a_verdict_by_condition() -> None:
     assert lines[0].startswith(
         "| `auto[x=y]` | one sun | 1 | 1.00 (1.00 to 1.00) | 0.50 (0.50 to 0.50) | 93.8 % | 88.2 %"
     )
-    assert [line.rsplit("|", 2)[1].strip() for line in lines] == ["in auto", "no gain", "no gain"]
+    assert [line.rsplit("|", 2)[1].strip() for line in lines] == ["accepted", "not accepted", "not accepted"]
     assert strategies.asked_of(["cascade=guided", "auto[a=b,c=d]"]) == ["auto[cascade=guided]", "auto[a=b,c=d]"]
 
 
 def test_images_in_our_model_stand_beside_the_most_of_any_mapper() -> None:
     def mapped(images: int, points: int) -> Row:
-        return {"registered": images, "points": points, "right": images, "reprojection_error_px": 0.5, "seconds": 9.0}
+        return {"registered": images, "points": points, "correct": images, "reprojection_error_px": 0.5, "seconds": 9.0}
 
-    own = {"registered": 8, "right": 8, "points": 300, "reprojection_error_px": 0.7, "seconds": 20.0}
+    own = {"registered": 8, "correct": 8, "points": 300, "reprojection_error_px": 0.7, "seconds": 20.0}
     head = {"block": "lewis", "every": 4, "preset": "auto", "images": 9, **own}
     first = head | {"given": "nothing", "by_incremental": 7, "by_global": 9}
     second = head | {"given": "positions", "by_incremental": 8, "by_global": 8}
     peer = {"incremental": mapped(6, 100), "global": mapped(8, 150)}
     text = real.table_of([first | {"pycolmap": peer}, second | {"pycolmap": peer}])
-    assert "all cases: 2.00 (2.00 to 2.00)" in text
-    assert ": 0.94 (0.89 to 1.00); fewer in 1 of 2 cases." in text
+    assert (
+        "all cases: 2.00; where it registers as many images by itself: 2.00. Images" in text
+    )  # one thinned block has no interval, however often something is given
+    assert ": 0.94; fewer in 1 of 2 cases." in text
+    other = [row | {"every": 3, "points": 150, "pycolmap": peer} for row in (first, second)]
+    text = real.table_of([*(row | {"pycolmap": peer} for row in (first, second)), *other])
+    assert "all cases: 1.50 (1.00 to 2.00); where it registers as many images by itself: 1.50 (1.00 to 2.00)." in text
+    assert ": 0.94 (0.94 to 0.94); fewer in 2 of 4 cases." in text
+    alone = {name: one | {"registered": 5} for name, one in peer.items()}
+    assert "by itself: -. Images" in real.table_of([first | {"pycolmap": alone}])
     line = "| lewis / 4 | nothing | `auto` | 9 | 8 | 8 | 7 / 9 | 6 / 8 | 8 | 300 | 150 | 0.70 | 0.50 | 20 | 9 |"
     assert line in text
+
+
+def test_one_model_of_ours_is_compared_with_one_of_pycolmap(tmp_path: Path) -> None:
+    camera = Camera("PINHOLE", 40, 30, (40.0, 40.0, 20.0, 15.0))
+    pose = AdjustedPose(np.zeros(3), np.eye(3), np.ones(3), np.ones(3))
+    names = ["a", "b", "c", "d", "e", "alone"]
+    # a, b and c share points 0 to 2 by b, and d and e three others; `alone` sees none, and point 6 is seen by none.
+    seen = {"a": [0, 1], "b": [0, 1, 2], "c": [2], "d": [3, 4, 5], "e": [3, 4, 5], "alone": []}
+    tracks = {k: np.array([(n, p) for n, p in enumerate(own)], np.int32).reshape(-1, 2) for k, own in seen.items()}
+    errors_px = np.array([0.1, 0.2, 0.6, 5.0, 5.0, 5.0, 5.0])
+    block = AdjustedBlock({"k": camera}, dict.fromkeys(names, pose), np.zeros((7, 3)), errors_px, tracks)
+    workspace = Workspace(tmp_path)
+    assert real.largest_group(workspace) == ([], {"registered": 0})
+    workspace.orientation.mkdir()
+    with workspace.final.open("wb") as stream:
+        write_adjusted(stream, block)
+    images = [Image(name, f"{name}.jpg", 40, 30, "k") for name in names]
+    workspace.images.write_text(images_text(images, dict.fromkeys(names, ""), {}), encoding="utf-8")
+    held, figures = real.largest_group(workspace)
+    assert sorted(held) == ["a.jpg", "b.jpg", "c.jpg"]
+    assert figures == {"registered": 3, "points": 3, "track_length": 2.0, "reprojection_error_px": 0.3}
 
 
 def test_what_cannot_be_measured_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

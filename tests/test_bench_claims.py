@@ -11,6 +11,7 @@ from benchmarks.claims.grounds import errors, ground, known_pair
 from benchmarks.claims.intervals import Estimate, change, column, estimate, of_sums, verdict
 from benchmarks.claims.sides import unknown_geometry
 from benchmarks.claims.work import Unit
+from benchmarks.exposure import under_exposed
 
 from aeromatch_cli.strategies.matchers.polar import Polar
 from aeromatch_cli.strategies.matchers.polar.fit import polar_grid
@@ -107,6 +108,14 @@ def test_layouts_have_as_many_samples():
         assert abs((np.hypot(*offsets.T) < 50.0).mean() - share) < 0.02
 
 
+def test_layouts_use_as_many_samples(monkeypatch):
+    monkeypatch.setattr(registration, "GRID_SIZE", (920, 690))
+    monkeypatch.setattr(registration, "GRID_PAIRS", 1)
+    used = {(row["start"], row["layout"]): row["samples"] for row in registration.grid_rows("grass", 1)}
+    for layout in registration.LAYOUTS:
+        assert abs(used["near", layout] / used["near", "dynamic polar"] - 1.0) < 0.02
+
+
 def test_a_start_is_as_far_off_as_asked():
     truth = np.array([[0.0, -1.1, 300.0], [1.1, 0.0, 20.0], [0.0, 0.0, 1.0]])
     start = registration._off(truth, (0.01, 0.6, 1.01), 0.3, (401, 301))
@@ -117,7 +126,8 @@ def test_a_start_is_as_far_off_as_asked():
 
 def test_under_exposed_shadow_is_noise():
     lit, shade, other = (
-        shadow.darkened(np.full((80, 80, 3), level, np.uint8), np.random.default_rng(level)) for level in (128, 40, 43)
+        under_exposed(np.full((80, 80, 3), level, np.uint8), 0.06, np.random.default_rng(level))
+        for level in (128, 40, 43)
     )
     # sRGB 128 is 0.2159 of full light, 40 is 0.0212: 0.06 of it is stored as 30 and 4 levels.
     assert lit.mean() == pytest.approx(30.1, abs=0.7)
@@ -190,6 +200,19 @@ def test_times_and_features_are_compared_and_what_is_missing_is_not_run():
     assert cells(text, "B1")[3:] == [
         "0.75 s: -99.0 % (-99.0 % to -99.0 %)", "37.50 s: -50.0 % (-50.0 % to -50.0 %)", "step beaten, whole missed",
     ]  # fmt: skip
+    assert cells(text, "B2")[2] == "of 2 pairs SIFT registers 2, polar 2 of these"
     assert cells(text, "B2")[5] == "step missed, whole beaten"
-    assert cells(text, "C1")[4:] == ["120: 3.00 x (3.00 x to 3.00 x)", "step missed, whole beaten"]
+    said = "step missed, whole beaten, of those run, two of them stand-ins"
+    assert cells(text, "C1")[4:] == ["120: 3.00 x (3.00 x to 3.00 x)", said]
+    few = page.tables([*rows, known("sand", 50.0, 0.5, 25.0) | {"sift_accepted": False}])
+    assert cells(few, "B2")[2] == "of 3 pairs SIFT registers 2, polar 2 of these"
+    assert cells(few, "B2")[5] == "step missed, whole beaten, on 2 of 3 pairs"
+    whole = [*rows, *(method(features.SUPERPOINT, 20) | {"pair": pair} for pair in ("a b", "c d"))]
+    assert cells(page.tables(whole), "C1")[5] == "step missed, whole beaten, two of them stand-ins"
     assert cells(text, features.SUPERPOINT) == [features.SUPERPOINT, *["not run"] * 6]
+
+
+def test_the_legend_says_in_words_what_arms_are():
+    lines = page.legend().splitlines()
+    assert len(lines) == len({**shadow.ARMS, **features.RIVALS, **features.OURS})
+    assert not any("=" in line or "`" in line for line in lines)

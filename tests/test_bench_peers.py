@@ -138,7 +138,8 @@ def test_published_matchers_take_their_weights_by_either_name_and_places_as_they
     old = {re.sub(r"transformers\.(\d)\.(self|cross)_attn", r"matcher.\2_attn.\1", key): one
            for key, one in own.state_dict().items()}  # fmt: skip
     assert "matcher.self_attn.0.out_proj.weight" in old
-    torch.save(old, tmp_path / "w.pt")
+    not_read = {"log_assignment.0.r": torch.ones(1), "extractor.model.net.skip1.1.bias": torch.ones(24)}
+    torch.save(old | not_read, tmp_path / "w.pt")
     scene = Scene("s", tmp_path, tmp_path, tmp_path, {}, (("a", "b"),))
     options = Options(60, "image", 1, 0, tmp_path)
     made = published.WithLightGlue(scene, options, features=_Stub, weights="w.pt", settings=settings)
@@ -160,10 +161,15 @@ def test_published_matchers_take_their_weights_by_either_name_and_places_as_they
     seen = asked[0]["image1"]
     np.testing.assert_allclose(seen["keypoints"][0].numpy(), places / 2.0, atol=1e-5)
     assert seen["image_size"].tolist() == [[60.0, 50.0]]
-    del old["matcher.self_attn.0.out_proj.weight"]
-    torch.save(old, tmp_path / "w.pt")
-    with pytest.raises(ConfigError, match="it lacks"):
-        published.WithLightGlue(scene, options, features=_Stub, weights="w.pt", settings=settings)
+    name = "matcher.self_attn.0.out_proj.weight"
+    for wrong, said in (
+        ({key: one for key, one in old.items() if key != name}, r"missing: transformers.0.self_attn.out_proj.weight"),
+        (old | {"matcher.self_attn.6.out_proj.weight": old[name]}, r"unexpected: self_attn.6.out_proj.weight"),
+        (old | {name: old[name][:-1]}, "wrong shape"),
+    ):
+        torch.save(wrong, tmp_path / "w.pt")
+        with pytest.raises(ConfigError, match=said):
+            published.WithLightGlue(scene, options, features=_Stub, weights="w.pt", settings=settings)
 
 
 def test_lines_hold_sums_and_the_first_method_beside() -> None:

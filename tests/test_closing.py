@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from aeromatch_cli.stages.quality import quality_of
 from aeromatch_cli.stages.result_summary import closing_lines
 
 NAMES = {i: f"{i}.jpg" for i in "abcd"}
+MANY = {str(i): f"{i}.jpg" for i in range(12)}
 # Of a group whose four positions are met as stated.
 PLACED = {"kind": "positions", "images": 4, "positions": {
     "images": 4, "used": 4, "wrong": [], "rms_m": [0.02, 0.02, 0.03], "rms_sigmas": [1.0, 1.0, 1.0],
@@ -20,7 +22,7 @@ PLACED = {"kind": "positions", "images": 4, "positions": {
 LEVEL = {"kind": "level"}
 
 
-def lines_of(**changes: Any) -> list[str]:
+def lines_of(names: Mapping[str, str] = NAMES, **changes: Any) -> list[str]:
     adjusted = {
         "outside": {}, "groups": [PLACED], "images": 4, "positions_given": 4, "track_length": 3.9, "held_by_pairs": 0,
         "reprojection_error_px": 0.2, "ground_pixel_m": 0.05,
@@ -32,10 +34,10 @@ def lines_of(**changes: Any) -> list[str]:
         "consistency": {"spread": {i: [9, 0, 100] for i in "abcd"} | changes.get("spread", {})}
         | changes.get("consistency", {}),
     }
-    results = filled(BlockResults, found)
-    quality = quality_of(results, NAMES)
+    results = filled(BlockResults, found | {k: changes[k] for k in ("orient", "pairs") if k in changes})
+    quality = quality_of(results, names)
     assert quality is not None
-    return closing_lines(quality, results, NAMES)
+    return closing_lines(quality, results, names)
 
 
 def test_a_block_against_which_nothing_speaks_is_good() -> None:
@@ -51,7 +53,7 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
     [
         (
             {"filter": {"components": [3, 1]}},
-            ["bad: 2 groups of images (3, 1) that no verified pair connects", "--set pairs=exhaustive"],
+            ["bad: 2 groups of images (3, 1) that no verified pair connects: more overlap between them helps"],
         ),
         (
             {"adjust": {"outside": {"b": "few matches"}, "images": 3}},
@@ -75,13 +77,48 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
         ),
         ({"filter": {"weakly_tied": ["c"]}}, ["good: all 4", "weak: c.jpg, with fewer than 50 verified matches"]),
         ({"spread": {"d": [9, 0, 3]}}, ["good", "weak: d.jpg, with fewer than 20 points that three images see"]),
-        ({"spread": {"a": [7, 2, 99]}}, ["good", "parts without a point though other images show them: a.jpg"]),
+        (
+            {"spread": {"a": [7, 2, 99]}},
+            [
+                "good",
+                "1 of 4 images has no point in a ninth of the picture or more whose ground other images show (a.jpg)",
+            ],
+        ),
     ],
 )
 def test_what_is_wrong_or_weak_is_named_with_what_to_do(changes: dict[str, Any], expected: list[str]) -> None:
     lines = lines_of(**changes)
     assert lines[0].startswith(f"result    {expected[0].partition(':')[0]}")
     assert all(any(words in line for line in lines) for words in expected), lines
+
+
+@pytest.mark.parametrize(
+    ("positions", "reason", "names", "said"),
+    [
+        (12, "overlap", MANY, True),
+        (12, "position", MANY, True),
+        (0, "overlap", MANY, False),  # found poses, of a first pass that compares all or those that look alike
+        (12, "exhaustive", MANY, False),
+        (4, "overlap", NAMES, False),  # the first pass has compared all pairs
+    ],
+)
+def test_all_pairs_are_advised_where_positions_may_hide_some(
+    positions: int, reason: str, names: dict[str, str], said: bool
+) -> None:
+    block = {"positioned": len(names), "pairs_by_reason": {reason: 9}}
+    lines = lines_of(
+        names, filter={"components": [3, 1]}, orient={"positions_given": positions}, pairs={"block": block}
+    )
+    (line,) = [line for line in lines if "groups of images (3, 1)" in line]
+    assert ("--set pairs=exhaustive finds pairs that positions hide" in line) == said
+
+
+def test_an_image_that_could_not_be_read_is_a_fault_of_its_own() -> None:
+    lost = {"outside": {"d": "no features: cannot decode image d.jpg"}, "images": 3}
+    lines = lines_of(filter={"components": [3], "unread": ["d"]}, adjust=lost, spread={})
+    said = "1 of 4 images is not in the block, since the pictures could not be read: replace or remove d.jpg"
+    assert lines[0] == f"result    bad: {said}; failures.csv says why"
+    assert not any(words in line for line in lines for words in ("weak", "overlap", "groups", "oriented:"))
 
 
 def test_a_part_of_a_run_has_no_verdict() -> None:

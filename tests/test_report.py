@@ -161,6 +161,15 @@ def row_with(page: str, table: str, *cells: str) -> list[str]:
     return found[0]
 
 
+def test_an_image_that_could_not_be_read_is_told_as_nothing_else(full):
+    StageReport("extract", items=4, done=3, failures=[("d", "cut off")]).write(full.workspace)
+    words = Structure.of(page_of(full)).words()
+    assert "1 image could not be read" in words
+    assert "1 connected group" in words
+    assert "unconnected groups" not in words
+    assert row_with(page_of(full), "image-table", "sub/d.png")[-1] == "could not be read."
+
+
 def test_rows_hold_the_numbers_of_the_workspace(full):
     found = gather(full)
     pairs, images = found.pairs, found.images

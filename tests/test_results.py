@@ -97,7 +97,8 @@ def test_commands_are_printed_instead_of_run(capsys: pytest.CaptureFixture[str])
     ("asked", "said"),
     [
         (["--only", "moon"], "moon are none of auto"),
-        (["--only", "growth"], "give the folder of real blocks with --data"),
+        (["--only", "growth"], "give a folder for results with --out"),
+        (["--only", "growth,peers,auto", "--out", "o"], "give the folder of real blocks with --data, for peers, auto"),
         (["--data", "nowhere", "--out", "o"], "nowhere is no folder"),
         (["--data", ".", "--out", "o", "--docs", "--quick"], "figures without worth"),
     ],
@@ -123,6 +124,16 @@ def test_a_benchmark_that_fails_is_named_and_the_others_run(
     )
     assert ran == ["growth", "robustness"]
     assert capsys.readouterr().err.startswith("failed: scripts/bench growth --out")
+
+
+@pytest.mark.parametrize("name", ["calibration", "growth", "speed", "robustness"])
+def test_pages_of_rendered_blocks_need_no_folder_of_real_ones(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ran: list[str] = []
+    monkeypatch.setattr(results, "_run", lambda asked: ran.append(asked[0]))
+    assert launcher.main(["results", "--only", name, "--quick", "--out", str(tmp_path)]) == 0
+    assert ran == [name]
 
 
 def stamp(**versions: Any) -> stamps.Stamp:

@@ -11,6 +11,8 @@ from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_yaw_pitch_roll
+from aeromatch_cli.sfm.mapping import Group
+from aeromatch_cli.stages.pairs import _apart
 
 CAMERA = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 ORIGIN = (333000.0, 3100000.0, 0.0)  # EPSG:32617
@@ -160,4 +162,23 @@ def test_missing_attitude_is_stated() -> None:
     rotations: list[FloatArray | None] = [*TILTED[:4], None, None]
     summary = summarise(block(rotations=rotations))
     assert summary.warnings == ()
-    assert "without attitude 2: paired by position" in "\n".join(summary.lines())
+    assert "without attitude 2: paired by position" in summary.lines()
+    given = summarise(block(rotations=[*TILTED]))
+    words = "without attitude 2: those given contradict the pictures and are not used; paired by position"
+    assert words in summary.lines(given)
+
+
+def test_images_are_apart_that_nothing_ties_to_the_world_or_to_the_largest_group() -> None:
+    large, small, placed = Group("level", ("a", "b", "c")), Group("level", ("d", "e")), Group("positions", ("f",))
+    assert _apart([large, small]) == {"d", "e"}
+    assert _apart([placed, large, small]) == {"a", "b", "c", "d", "e"}
+    assert _apart([large]) == _apart([placed]) == _apart([]) == set()
+
+
+def test_the_extent_is_of_images_whose_places_to_each_other_are_known() -> None:
+    found = block()
+    assert "extent           100.0 m east-west, 25.0 m north-south" in summarise(found).lines()
+    far = {"img4", "img5"}
+    moved = {i: replace(p, center_m=p.center_m + 1000.0 * (i in far)) for i, p in found.poses.items()}
+    lines = summarise(replace(found, poses=moved), apart=far).lines()
+    assert "extent           60.0 m east-west, 15.0 m north-south, of 4 images that hang together" in lines

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -22,8 +22,8 @@ class BlockSummary:
     """Figures of a block; NaN where nothing is known. Heights are above the ground below each camera.
 
     metric: whether lengths are metres; else the frame is the pictures' own. extent_m: east-west and north-south extent
-    of the projection centres. best_overlap: mean over the paired images of the overlap with their best neighbour.
-    warnings: one sentence each: what, which images, what to do.
+    of the projection centres, of so many `together` whose places to each other are known. best_overlap: mean over the
+    paired images of the overlap with their best neighbour. warnings: one sentence each: what, which images, what to do.
     """
 
     images: int
@@ -39,6 +39,7 @@ class BlockSummary:
     max_tilt_deg: float
     gsd_m: float
     extent_m: tuple[float, float]
+    together: int
     pairs: int | None
     pairs_by_reason: tuple[tuple[str, int], ...]
     best_overlap: float
@@ -53,8 +54,9 @@ class BlockSummary:
             f"world            {self.crs}, origin {self.origin_m[0]:.0f} {self.origin_m[1]:.0f} {self.origin_m[2]:.0f}",
         ]
 
-    def lines(self) -> list[str]:
-        """The summary of an oriented block for a person, one fact per line, without the warnings."""
+    def lines(self, given: BlockSummary | None = None) -> list[str]:
+        """The summary of an oriented block for a person, one fact per line, without the warnings. given: of the same
+        block before it was oriented."""
         low, median, high = self.flying_height_m
         east, north = self.extent_m
         found = [f"ground           {self.ground_source or 'unknown'}"]
@@ -63,7 +65,8 @@ class BlockSummary:
             found.append("scale            arbitrary: no position ties the frame to metres, or to north")
         if self.positioned:
             along = ("east-west", "north-south") if self.metric else ("along x", "along y")
-            found.append(f"extent           {length(east)} {along[0]}, {length(north)} {along[1]}")
+            parts = f", of {self.together} images that hang together" if self.together < self.positioned else ""
+            found.append(f"extent           {length(east)} {along[0]}, {length(north)} {along[1]}{parts}")
         if np.isfinite(median):
             found.append(f"flying height    {length(median)} ({low:.1f} to {high:.1f}) above ground")
         if np.isfinite(self.mean_tilt_deg):
@@ -76,7 +79,9 @@ class BlockSummary:
         if self.positioned < self.images:
             found.append(f"without position {self.images - self.positioned}: paired by name and time")
         if self.oriented < self.positioned:
-            found.append(f"without attitude {self.positioned - self.oriented}: paired by position")
+            refuted = given is not None and given.oriented > self.oriented
+            why = "those given contradict the pictures and are not used; " if refuted else ""
+            found.append(f"without attitude {self.positioned - self.oriented}: {why}paired by position")
         if not self.oriented:
             found.append("views            source images only: no attitudes")
         elif not np.isfinite(median):
@@ -94,6 +99,7 @@ class BlockSummary:
         found = {key: _plain(value) for key, value in asdict(self).items()}
         if not self.metric:
             found |= dict.fromkeys(("flying_height_m", "gsd_m", "extent_m"))
+        found.pop("together")
         return found | {"pairs_by_reason": dict(self.pairs_by_reason)}
 
 
@@ -103,14 +109,15 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def summarise(block: Block, pairs: Sequence[Pair] | None = None) -> BlockSummary:
+def summarise(block: Block, pairs: Sequence[Pair] | None = None, apart: Collection[str] = ()) -> BlockSummary:
     """Figures and plausibility of a block.
 
-    pairs: the chosen pairs, or None before they are chosen.
+    pairs: the chosen pairs, or None before they are chosen. apart: images whose distance from the others is arbitrary.
     """
     names = {image.image_id: image.name for image in block.images}
     poses = {i: block.poses[i] for i in names if i in block.poses and np.isfinite(block.poses[i].center_m).all()}
     centers_m = np.array([pose.center_m for pose in poses.values()]).reshape(-1, 3)
+    together_m = centers_m[[image_id not in apart for image_id in poses]]
     tilts_deg = [tilt_deg(pose.world_rotation) for pose in poses.values() if pose.world_rotation is not None]
     gsds_m = [footprint.gsd_m for footprint in block_footprints(block).values()]
     unpaired = () if pairs is None else _unpaired(names, pairs)
@@ -127,7 +134,8 @@ def summarise(block: Block, pairs: Sequence[Pair] | None = None) -> BlockSummary
         mean_tilt_deg=_known(np.mean, tilts_deg),
         max_tilt_deg=_known(np.max, tilts_deg),
         gsd_m=_known(np.median, gsds_m),
-        extent_m=(_known(np.ptp, centers_m[:, 0]), _known(np.ptp, centers_m[:, 1])),
+        extent_m=(_known(np.ptp, together_m[:, 0]), _known(np.ptp, together_m[:, 1])),
+        together=len(together_m),
         pairs=None if pairs is None else len(pairs),
         pairs_by_reason=tuple(sorted(Counter(pair.reason for pair in pairs or ()).items())),
         best_overlap=_known(np.mean, list(_best_overlaps(pairs or ()).values())),

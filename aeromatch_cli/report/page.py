@@ -179,6 +179,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
         images=sorted(images, key=lambda row: (row.verified_matches, row.image_id))[:MAX_TABLE_ROWS],
         image_count=len(images),
         weak_matches=WEAK_MATCHES,
+        unread=links.unread,
         wrong=wrong,
         stages=stages,
         settings=_settings_text(context),
@@ -307,6 +308,10 @@ def notices(
         shown = ", ".join(f"{size:,}" for size in sizes[:12] if size > 1)
         text = f"Sizes of the groups with more than one image: {shown}. Images tied to no other: {alone:,}."
         found.append(Notice("bad", f"The block falls into {len(sizes):,} unconnected groups of images", text))
+    if links.unread:
+        title = counted(len(links.unread), "image could not be read", "images could not be read")
+        text = "Replace or remove the files and run again; failures.csv says why."
+        found.append(Notice("bad", title, text, tuple(names[i] for i in links.unread)))
     found += [] if oriented is None else _orientation_notices(oriented, names)
     if links.weakly_tied and links.verified_matches:
         ties = {row.image_id: row for row in images}

@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from aeromatch_cli import graph
-from aeromatch_cli.data import BoolArray, Image, Pose, Verdict
+from aeromatch_cli.data import BoolArray, FloatArray, Image, Pose, Verdict
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.files import read_json, read_record
 from aeromatch_cli.formats.archives import ARCHIVE_FAULTS
 from aeromatch_cli.formats.reading import readable
 from aeromatch_cli.formats.tables import read_csv
-from aeromatch_cli.geometry.cameras import corner_params
+from aeromatch_cli.geometry.cameras import corner_params, undistort
+from aeromatch_cli.geometry.epipolar import fundamental_from_poses, symmetric_distance_px
 from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.remote import is_remote
@@ -27,7 +28,7 @@ from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
 from aeromatch_cli.results.record import StageRecord
-from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult
+from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult, OrientResult
 from aeromatch_cli.sfm.georeferencing import LOCAL_FLYING_HEIGHT
 from aeromatch_cli.sfm.quality.finding import Quality
 from aeromatch_cli.stages.cascade import feature_workspaces
@@ -121,8 +122,11 @@ def _workspace(work: _Work) -> Shown:
 
 
 def _block_lines(work: _Work) -> Iterator[str]:
+    orient = result_on_file(work.workspace, OrientResult)
+    given = len(work.poses) if orient is None else orient.positions_given
     attitudes = sum(pose.world_rotation is not None for pose in work.poses.values())
-    yield f"images      {len(work.images)}, {len(work.poses)} with position, {attitudes} with attitude"
+    oriented = attitudes if work.adjusted is None else len(work.adjusted.poses)
+    yield f"images      {len(work.images)}, {given} with position given; {oriented} oriented"
     block = read_json(work.workspace.block)
     scale = "" if block.get("metric", True) else ", of arbitrary scale"
     yield f"world       {block['crs']}{scale}, origin {' '.join(f'{v:.0f}' for v in block['origin_m'])}"
@@ -153,7 +157,8 @@ def _export_lines(workspace: Workspace) -> Iterator[str]:
     written = set() if exported is None else set(exported.exporters)
     older = ", of an earlier adjustment: run aeromatch export" if workspace.export_is_older else ""
     for one in workspace.exported():
-        yield f"export      {one}{older if one.name in written else ' (of an earlier run)'}"
+        earlier = ", of earlier results" if workspace.is_older_export(one) else ""
+        yield f"export      {one}{older if one.name in written else earlier}"
 
 
 def _verdict_lines(workspace: Workspace, quality: Quality | None) -> Iterator[str]:
@@ -298,9 +303,9 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     kept = found.matches if verdict.state == "verified" else None
     count = 0 if kept is None else len(kept.indices)
     lines.append(f"matches     {len(raw.matches.indices)} by {raw.strategy}, {count} verified: {verdict.state}")
-    lines += [*_verdict_of_pair(verdict), *_pass_lines(workspace, ids)]
     sides = [work.keypoints_px(i) for i in ids]
     points = match_points(kept, *sides) if kept is not None else (np.zeros((0, 2)), np.zeros((0, 2)))
+    lines += [*_verdict_of_pair(verdict), *_adjusted_lines(work, ids, points), *_pass_lines(workspace, ids)]
     dropped = match_points(raw.matches, *sides) if rejected or kept is None else None
     target = out or _own_file(workspace, f"{ids[0]}--{ids[1]}.png")
     words = f"green to yellow by error{', dropped ones red' if dropped is not None else ''}"
@@ -326,10 +331,33 @@ def _verdict_of_pair(verdict: Verdict) -> Iterator[str]:
         yield f"            {verdict.reason}"
     for name, number in verdict.rejected.items():
         if number:
-            yield f"dropped     {number} by {name}"
+            stage = f"the stage {name}" if name == "consistency" else f"{name} of the stage filter"
+            yield f"dropped     {number} by {stage}"
     if verdict.errors_px is not None and len(verdict.errors_px):
         low, middle, high = np.nanpercentile(verdict.errors_px, [5, 50, 95])
         yield f"errors      median {middle:.2f} px, 90 % between {low:.2f} and {high:.2f} px"
+
+
+def _adjusted_lines(work: _Work, ids: tuple[str, str], points: tuple[FloatArray, FloatArray]) -> Iterator[str]:
+    """Say how far the matches (M, 2) of a pair that are left lie off the adjusted poses, and why the stage consistency
+    has left matches that contradict these."""
+    block = work.adjusted
+    if block is None or not len(points[0]) or not block.poses.keys() >= set(ids):
+        return
+    if block.frames.get(ids[0], 0) == block.frames.get(ids[1], 0):
+        camera0, camera1 = (block.cameras[work.images[i].camera_id] for i in ids)
+        pose0, pose1 = (Pose(block.poses[i].center_m, block.poses[i].rotation, 0.0, 0.0) for i in ids)
+        matrix = fundamental_from_poses(camera0, pose0, camera1, pose1)
+        places = undistort(camera0, points[0]), undistort(camera1, points[1])
+        middle, far = np.nanpercentile(symmetric_distance_px(matrix, *places), [50, 95])
+        off = f"median {middle:.2f} px off the epipolar lines of the adjusted poses, 95 % within {far:.2f} px"
+        yield f"adjusted    {off}"
+    found = result_on_file(work.workspace, ConsistencyResult)
+    for image_id in sorted(set(ids) & set([] if found is None else found.doubtful)):
+        yield (
+            f"consistency most matches of {work.names[image_id]} contradict its adjusted pose: the stage doubts the "
+            "pose, and has dropped none of its matches"
+        )
 
 
 def _pass_lines(workspace: Workspace, ids: tuple[str, str]) -> Iterator[str]:

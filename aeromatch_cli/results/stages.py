@@ -9,6 +9,8 @@ from pydantic import Field
 from aeromatch_cli.results.adjustment import Control, GroupResult, PlacementKind, PoseResiduals
 from aeromatch_cli.results.record import Record
 
+UNREAD = "Images whose pictures could not be read; the other lists, and the groups, are without them."
+
 
 class StageResult(Record):
     """What one stage reports besides its counts and its time. stage: its name."""
@@ -183,6 +185,7 @@ class Connection(StageResult):
     components: list[int] = Field([], description="Sizes of the groups of images that verified pairs connect.")
     weakly_tied: list[str] = Field([], description="Images with few verified matches.")
     unconnected: list[str] = Field([], description="Images with no verified match.")
+    unread: list[str] = Field([], description=UNREAD)
 
 
 class FilterResult(Connection):
@@ -258,6 +261,7 @@ class ConsistencyResult(StageResult):
     components: list[int] | None = Field(None, description="As of the stage filter, of the final matches.")
     weakly_tied: list[str] = Field([], description="Images with few final matches.")
     unconnected: list[str] = Field([], description="Images with no final match.")
+    unread: list[str] = Field([], description=UNREAD)
     dropped_matches: int = Field(0, description="Matches that contradict the adjusted block or are unlikely.")
     rejected_pairs: int = Field(0, description="Pairs all of whose matches were dropped.")
     expected_right: float | None = Field(None, description="Share (0-1) of the final ones that is right to 3 px.")

@@ -101,7 +101,7 @@ def command_result(
     if command in ("run", "export") and not part:
         written = next((r.result.exporters for r in reports if isinstance(r.result, ExportResult)), {})
         lines += [f"export    {workspace.export(e.name)}" for e in settings.export if e.name in written]
-        lines += [f"export    {folder} is of earlier settings, not made anew" for folder in _left(workspace, settings)]
+        lines += [f"export    {folder} is of earlier results, not made anew" for folder in _left(workspace, settings)]
     if failures:
         lines.append(f"{len(failures)} failed, listed in {workspace.failures}")
         urgent.append(lines[-1])
@@ -123,9 +123,9 @@ def block_of(reports: Sequence[StageReport]) -> PairsResult:
 
 
 def _left(workspace: Workspace, settings: Settings) -> list[Path]:
-    """Folders of exporters that the settings no longer name."""
+    """Folders of exporters that the settings no longer name, and that are not of the present results."""
     wanted = {exporter.name for exporter in settings.export}
-    return [folder for folder in workspace.exported() if folder.name not in wanted]
+    return [one for one in workspace.exported() if one.name not in wanted and workspace.is_older_export(one)]
 
 
 def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:

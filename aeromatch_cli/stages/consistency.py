@@ -84,6 +84,7 @@ def run(context: Context) -> StageReport:
         components=left.components,
         weakly_tied=left.weakly_tied,
         unconnected=left.unconnected,
+        unread=left.unread,
         expected_right=found.expected_right,
         doubtful=found.doubtful,
         points=len(adjusted.points_m),

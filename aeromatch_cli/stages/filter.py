@@ -28,7 +28,7 @@ from aeromatch_cli.results.stages import FilterResult
 from aeromatch_cli.stages import driver
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.driver import PairTask, RowResult, run_rows
-from aeromatch_cli.stages.stage_report import StageReport, unexplained
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures, unexplained
 from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.store.block_store import KnownVerdict, verdicts_of
 from aeromatch_cli.store.matches import match_points, select
@@ -139,7 +139,7 @@ def _result_on_file(context: Context, report: StageReport) -> FilterResult | Non
 
 def connection(context: Context, judged: Iterable[tuple[str, str, str, int]] | None = None) -> FilterResult:
     """States of the pairs, verified matches, sizes of the groups of images that verified pairs connect, and images
-    that are weakly tied or not at all.
+    that are weakly tied, not at all, or could not be read.
 
     judged: ids of both images, state and number of matches of every judged pair; by default those of this stage.
     """
@@ -158,11 +158,13 @@ def connection(context: Context, judged: Iterable[tuple[str, str, str, int]] | N
             matches += count
             ties.update({id0: count, id1: count})
             links.append((id0, id1))
-    ids = [image.image_id for image in context.block.images]
+    failed = {item for stage, item, _ in gather_failures(context.workspace) if stage == "extract"} - set(ties)
+    ids = [image.image_id for image in context.block.images if image.image_id not in failed]
     return FilterResult(
         pairs=dict(sorted(states.items())),
         verified_matches=matches,
         components=sorted(Counter(labels_by_name(ids, links).values()).values(), reverse=True),
         weakly_tied=sorted(image_id for image_id in ids if ties[image_id] < WEAK_MATCHES),
         unconnected=sorted(image_id for image_id in ids if not ties[image_id]),
+        unread=sorted(image.image_id for image in context.block.images if image.image_id in failed),
     )

@@ -32,6 +32,8 @@ from aeromatch_cli.strategies.simulators.none import SourceOnly
 # no less than so many pixels), share of the keypoints, neighbours.
 _LOOK_SIZE_PX, _LOOK_SHARE, _LOOK_LEAST_PX = 1200, 0.6, 400
 _LOOK_KEYPOINTS, _LOOK_NEIGHBOURS = 0.5, 8
+# So many images are all compared with each other, whatever their positions say.
+ALL_PAIRS_UP_TO = _LOOK_NEIGHBOURS + 1
 # A block that falls into parts is searched once more with so many times the keypoints, where it has so many pairs at
 # most: comparing them takes the square of that as long.
 _MORE_KEYPOINTS, _MOST_DEAR_PAIRS = 3, 2000

@@ -23,11 +23,14 @@ def lost_images(results: BlockResults, unread: Sequence[tuple[str, str]], names:
     unread: images that are not part of the block, with the reason. names: of the files, by image_id.
     """
     lost = [(name, _FAILED, reason) for name, reason in unread]
+    links = results.connection
+    failed = [] if links is None else links.unread
     if results.adjust is not None and results.adjust.images:
-        lost += [(names.get(i, i), _UNORIENTED, reason) for i, reason in results.adjust.outside.items()]
-    elif results.connection is not None:
-        reason = "no pair of it is verified"
-        lost += [(names.get(i, i), _UNCONNECTED, reason) for i in results.connection.unconnected]
+        outside = results.adjust.outside.items()
+        lost += [(names.get(i, i), _FAILED if i in failed else _UNORIENTED, reason) for i, reason in outside]
+    elif links is not None:
+        lost += [(names.get(i, i), _FAILED, "failures.csv says why") for i in failed]
+        lost += [(names.get(i, i), _UNCONNECTED, "no pair of it is verified") for i in links.unconnected]
     return sorted(lost)
 
 

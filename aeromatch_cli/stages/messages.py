@@ -88,6 +88,8 @@ def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) 
     lines = [f"pairs: {states}; {found.verified_matches} verified matches"]
     if part:
         return lines
+    if found.unread:
+        lines.append(f"could not be read: {listed([names[i] for i in found.unread])}")
     components = found.components
     if len(components) > 1:
         shown = ", ".join(str(size) for size in components[:8]) + (", ..." if len(components) > 8 else "")

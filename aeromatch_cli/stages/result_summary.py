@@ -42,7 +42,11 @@ def _weak(results: BlockResults, names: Mapping[str, str]) -> list[str]:
         lines.append(f"weak: {_listed(loose, names)}, with fewer than {_FEW_POINTS} points that three images see")
     empty = [i for i, ninths in spread.items() if ninths.empty]
     if empty:
-        lines.append(f"parts without a point though other images show them: {_listed(empty, names)}")
+        verb = "has" if len(empty) == 1 else "have"
+        lines.append(
+            f"{len(empty)} of {len(spread)} images {verb} no point in a ninth of the picture or more whose ground "
+            f"other images show ({_listed(empty, names)}): less evenly tied, which does not change the verdict"
+        )
     return lines
 
 

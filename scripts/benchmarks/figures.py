@@ -56,13 +56,13 @@ RESULTS: Sequence[Result] = (
     Result(
         "Rendered blocks of two seeds, poses off by 3 degrees and 5 % of the flying height: one sun, two suns, two "
         "exposures, five cameras, grass, desert, rows, facades",
-        "`auto` has {baseline} x the correct matches of `baseline`, {pycolmap} x those of pycolmap (guided); {right} "
-        "of what it keeps is right, of pycolmap's {theirs}; worst block {worst}",
+        "`auto` has {baseline} x the correct matches of `baseline`, {pycolmap} x those of pycolmap (guided); {share} "
+        "of what it keeps is correct, of pycolmap's {theirs}; worst block {worst}",
         {
             "baseline": _auto("auto / it", "baseline"),
             "pycolmap": _auto("auto / it", "pycolmap-guided"),
-            "right": _auto("right", "auto"),
-            "theirs": _auto("right", "pycolmap-guided"),
+            "share": _auto("correctness", "auto"),
+            "theirs": _auto("correctness", "pycolmap-guided"),
             "worst": _auto("worst block", "auto"),
         },
         "scripts/bench auto rendered",

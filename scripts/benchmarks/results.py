@@ -7,6 +7,7 @@ has a folder for each state of aeromatch_cli. A benchmark that fails does not ke
 
 from __future__ import annotations
 
+import argparse
 import shlex
 import subprocess
 import sys
@@ -58,7 +59,7 @@ def words(run: str, given: Mapping[str, str], *, docs: bool = False, quick: bool
 def main(arguments: Sequence[str]) -> int:
     parser = options.make_parser("results", __doc__)
     add = parser.add_argument
-    add("--data", type=Path, metavar="DIR", help="folder of real blocks: BLOCK/images and BLOCK/reference")
+    add("--data", type=Path, metavar="DIR", help="folder of real blocks, BLOCK/images and BLOCK/reference")
     add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks; else without")
     add("--only", type=options.names, default=",".join(STANDING), help="comma-separated")
     add("--docs", action="store_true", help="write the tables into docs/results and their figures into the README")
@@ -70,8 +71,8 @@ def main(arguments: Sequence[str]) -> int:
         parser.error(f"--only: {', '.join(unknown)} are none of {', '.join(STANDING)}")
     if args.docs and args.quick:
         parser.error("--docs and --quick: small runs make figures without worth, which do not belong into docs/results")
-    if not args.list and (args.data is None or args.out is None):
-        parser.error("give the folder of real blocks with --data, and one for results with --out")
+    if not args.list:
+        _check_folders(parser, args)
     for folder in (args.data, args.reference_weights):
         if folder is not None and not folder.is_dir():
             parser.error(f"{folder} is no folder")
@@ -95,6 +96,15 @@ def main(arguments: Sequence[str]) -> int:
     for command in failed:
         print(f"failed: {command}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def _check_folders(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Real blocks are asked for by those pages alone whose commands hold DATA."""
+    if args.out is None:
+        parser.error("give a folder for results with --out")
+    reading = [name for name in args.only if any("DATA" in shlex.split(run) for run in STANDING[name].runs)]
+    if reading and args.data is None:
+        parser.error(f"give the folder of real blocks with --data, for {', '.join(reading)}")
 
 
 def _text(folder: Path | None) -> str:

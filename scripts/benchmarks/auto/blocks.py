@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.exposure import write_under_exposed
 from benchmarks.scenes import Judged, Selection, judged_block, render_asked
 
 # A flight of its own name: straight above, every second picture under-exposed.
 EXPOSED = "exposed"
-# Of the light of an under-exposed picture, and the noise of its sensor, in levels of 8 bits.
-_DARKER, _NOISE = 1.0 / 8.0, 1.5
-_GAMMA = 2.2
+# Share of the light of a well exposed picture.
+_LIGHT = 1.0 / 8.0
 _EVERY_PAIR = 1_000_000
 # Condition -> SCENE:FLIGHT of its blocks; a block may be of several.
 CONDITIONS: Mapping[str, tuple[str, ...]] = {
@@ -67,29 +67,21 @@ def asked_blocks(args: argparse.Namespace) -> Iterator[tuple[Block, Judged]]:
             given = argparse.Namespace(**{**vars(args), "images": images})
             folder = render_asked(given, scene, flight="nadir" if flight == EXPOSED else flight, seed=seed)
             if flight == EXPOSED:
-                folder = under_exposed(folder)
+                folder = darker_block(folder)
             yield Block(place, seed), judged_block(scene, folder, Selection("all", _EVERY_PAIR, seed))
 
 
-def under_exposed(folder: Path) -> Path:
-    """A copy of a rendered block, of which every second picture by name got an eighth of the light, with a sensor's
-    noise, in 8 bits: dark parts have lost their contrast. The truth is the same."""
-    import cv2
-
-    out = folder.with_name(f"{folder.name}-{EXPOSED}")
+def darker_block(folder: Path) -> Path:
+    """A copy of a rendered block, of which every second picture by name got an eighth of the light. The truth is the
+    same."""
+    out = folder.with_name(f"{folder.name}-{_LIGHT:g}-of-light")
     if out.is_dir():
         return out
     part = out.with_name(f"{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     shutil.copytree(folder, part)
     for number, path in enumerate(sorted((part / "images").iterdir())):
-        if number % 2 == 0:
-            continue
-        pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        assert pixels is not None
-        light = _DARKER * (pixels / 255.0) ** _GAMMA
-        noise = _NOISE * np.random.default_rng(number).standard_normal(pixels.shape)
-        darker = np.clip(np.rint(255.0 * light ** (1.0 / _GAMMA) + noise), 0, 255).astype(np.uint8)
-        cv2.imwrite(str(path), darker, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        if number % 2:
+            write_under_exposed(path, path, _LIGHT, np.random.default_rng(number))
     part.rename(out)
     return out

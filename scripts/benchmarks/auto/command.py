@@ -6,20 +6,21 @@
               degrees); peers every pair of the block that overlaps by 20 % or more. These pairs count, whether a preset
               tries them or not, and no others. `polar` is asked where all pictures look straight down
   strategies  `auto` with other settings (--strategies, each KEY=VALUE or auto[KEY=VALUE,...]) on the same blocks,
-              beside `auto`: "in auto" where it brings 2 % more right matches at no lower share of right ones (to 0.1
-              percent points), or a fifth fewer wrong ones for at most 1 % fewer right ones
+              beside `auto`: accepted where it brings 2 % more correct matches at no lower correctness (to 0.1 percent
+              points), or a fifth fewer wrong ones for at most 1 % fewer correct ones
   real        every k-th image of real blocks (DATA/BLOCK/images, DATA/BLOCK/reference/{poses.csv,block.json}), with
-              positions that are off by 5 m or nothing, cameras from EXIF: images in the largest group of the adjusted
+              positions that are off by 5 m or nothing, cameras from EXIF: images in the largest group of the exported
               block, beside what both of pycolmap's mappers (incremental / global) register from the same run's export
-              and from pycolmap's own chain: its SIFT of the same size and number, exhaustive guided matching. Right:
-              attitudes within 3 degrees of the reference after one common turn. Points: of the exported model. Points,
-              error, seconds of pycolmap: of the mapper that registers more; seconds are those of the whole chain
+              and from pycolmap's own chain: its SIFT of the same size and number, exhaustive guided matching. Correct
+              attitudes: within 3 degrees of the reference after one common turn. They, points and error are of the
+              images of the largest group here, of the largest model of the mapper that registers more there;
+              its seconds are those of the whole chain
 
-Correct: within 3 px of the exact place in both directions. Right: the share of the kept matches that is correct, in the
-block where it is least, too. Auto / it: correct matches on the same pairs. Seconds: of whole runs without report on one
-core, of peers of features, matching and verification. Methods with SIFT have --keypoints descriptors an image, those
-with networks half as many; a cascade has both. In brackets: 90 % intervals by bootstrap, over pairs in rendered blocks,
-over cases in real ones. What OUT has of the same code and options is not made again.
+Correct: within 3 px of the exact place in both directions. Correctness: share of the kept matches that is correct, in
+the block where it is least, too. Auto / it: correct matches on the same pairs. Seconds: of whole runs without report on
+one core, of peers of features, matching and verification. Methods with SIFT have --keypoints descriptors an image,
+those with networks half as many; a cascade has both. In brackets: 90 % intervals by bootstrap, over pairs in rendered
+blocks, over thinned blocks in real ones. What OUT has of the same code and options is not made again.
 """
 
 from __future__ import annotations

@@ -12,22 +12,29 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import load, parse_method
+from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.evaluate.mapping import Mapper, map_database
 from aeromatch_cli.files import read_json, write_json
+from aeromatch_cli.formats.adjusted import read_adjusted
+from aeromatch_cli.formats.tables import read_images
+from aeromatch_cli.geometry.components import component_labels
+from aeromatch_cli.workspace import Workspace
 from benchmarks.auto.colmap import matched_by_colmap
 from benchmarks.orientation.cases import worsened
 from benchmarks.orientation.figures import attitudes_of, most_alike
 from benchmarks.sources import OUR_CODE, PEER_CODE, code_digest
-from benchmarks.tables import Row, interval, markdown, number, ranged, ratio, ratio_of_sums
+from benchmarks.tables import Row, interval, markdown, number, plain, ranged, ratio, ratio_of_sums
 from benchmarks.whole import budget_settings, chosen_images, whole_run
 
 # What is given -> case of the benchmark of orientation.
 GIVEN = {"positions": "noise", "nothing": "nothing"}
+_OWN_CODE = "benchmarks/auto/real.py"
 MAPPERS: tuple[Mapper, ...] = ("incremental", "global")
 # Of attitudes after one common turn.
-RIGHT_DEG = 3.0
+CORRECT_DEG = 3.0
 HEADS = (
-    "block", "given", "preset", "images", "in our model", "right", "from our export", "by pycolmap alone", "right",
+    "block", "given", "preset", "images", "in our model", "attitudes correct", "from our export",
+    "by pycolmap alone", "attitudes correct",
     "points", "its points", "error px", "its error px", "s", "its s",
 )  # fmt: skip
 
@@ -52,7 +59,7 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
 
 def _kept(args: argparse.Namespace, path: Path, code: Sequence[str], make: Any) -> Row:
     """What a file has of the same options and code, else what `make` returns."""
-    asked = {"keypoints": args.keypoints, "max_size": args.max_size, "code": code_digest(*code)}
+    asked = {"keypoints": args.keypoints, "max_size": args.max_size, "code": code_digest(*code, _OWN_CODE)}
     known = read_json(path) if path.is_file() else {}
     if known.get("asked") != asked:
         known = {"asked": asked, "row": make()}
@@ -70,18 +77,39 @@ def _by_preset(args: argparse.Namespace, images: Path, reference: Path, folder: 
     settings = [*budget_settings(load(preset, own), args.keypoints), *own]
     extra = [*extra, "--max-size", str(args.max_size)]
     run = whole_run("run", preset, images, work, extra=extra, jobs=args.jobs, settings=settings)
-    row: Row = {"registered": 0, "right": 0, "seconds": run.seconds, "code": run.code}
+    row: Row = {"registered": 0, "correct": 0, "seconds": run.seconds, "code": run.code}
     if run.answer:
-        groups = run.answer["stages"]["adjust"]["result"].get("groups", [])
-        best = max(groups, key=lambda group: group["images"], default={"images": 0})
-        row["registered"] = best["images"]
-        row |= {key: best.get(key) for key in ("track_length", "reprojection_error_px")}
-        row["points"] = run.answer["stages"]["consistency"]["result"].get("points_left", best.get("points"))
-        row["right"] = _right(attitudes_of(work / "orientation" / "orientation.csv"), reference)
+        held, figures = largest_group(Workspace(work))
+        row |= figures
+        attitudes = attitudes_of(work / "orientation" / "orientation.csv")
+        row["correct"] = _correct({name: attitudes[name] for name in held}, reference)
         database = work / "export" / "colmap" / "database.db"
         row |= {f"by_{m}": map_database(database, images, m).get("registered", 0) for m in MAPPERS}
     shutil.rmtree(work, ignore_errors=True)
     return row
+
+
+def largest_group(workspace: Workspace) -> tuple[list[str], Row]:
+    """Names of the most images that points of the exported model tie together, and figures of these and their points:
+    what a mapper says of one model. Images that see no point are not counted there either."""
+    path = workspace.final_or_adjusted
+    block = read_adjusted(path) if path.is_file() else AdjustedBlock.empty()
+    ids, tracks = list(block.tracks), list(block.tracks.values())
+    if not block.observations:
+        return [], {"registered": 0}
+    images = np.repeat(np.arange(len(ids)), [len(track) for track in tracks])
+    points = np.concatenate([track[:, 1] for track in tracks])
+    part_of = component_labels(len(ids) + len(block.points_m), np.column_stack([images, len(ids) + points]))
+    sizes = np.bincount(part_of[np.unique(images)])
+    own = part_of == sizes.argmax()
+    errors_px = block.errors_px[own[len(ids) :]]
+    name_of = {image.image_id: image.name for image in read_images(workspace.images)}
+    return [name_of[image] for image, in_group in zip(ids, own, strict=False) if in_group], {
+        "registered": int(sizes.max()),
+        "points": len(errors_px),
+        "track_length": plain(own[images].sum() / len(errors_px)),
+        "reprojection_error_px": plain(float(errors_px.mean())),
+    }
 
 
 def _by_pycolmap(args: argparse.Namespace, images: Path, reference: Path, folder: Path) -> Row:
@@ -92,26 +120,28 @@ def _by_pycolmap(args: argparse.Namespace, images: Path, reference: Path, folder
     for mapper in MAPPERS:
         found = map_database(database, images, mapper, attitudes=True)
         own = {name: np.array(rotation) for name, rotation in found.pop("attitudes", {}).items()}
-        row[mapper] = {**found, "right": _right(own, reference), "seconds": seconds + found.get("seconds", 0.0)}
+        row[mapper] = {**found, "correct": _correct(own, reference), "seconds": seconds + found.get("seconds", 0.0)}
     database.unlink()
     return row
 
 
-def _right(found: Mapping[str, Any], reference: Path) -> int:
+def _correct(found: Mapping[str, Any], reference: Path) -> int:
     """Images whose attitudes agree with the reference's after one common turn."""
-    return most_alike(found, attitudes_of(reference / "poses.csv"), RIGHT_DEG)
+    return most_alike(found, attitudes_of(reference / "poses.csv"), CORRECT_DEG)
 
 
 def best_mapper(peer: Row) -> Row:
     """Of pycolmap's own chain the mapper that registers most images."""
-    found: Row = max((peer[mapper] for mapper in MAPPERS), key=lambda row: (row.get("registered", 0), row["right"]))
+    found: Row = max((peer[mapper] for mapper in MAPPERS), key=lambda row: (row.get("registered", 0), row["correct"]))
     return found
 
 
 def table_of(rows: Sequence[Row]) -> str:
     """A line for every case, and the sums."""
     lines: list[list[object]] = []
-    points, images = [], []
+    points: dict[str, list[tuple[float, float]]] = {}
+    alike: dict[str, list[tuple[float, float]]] = {}
+    images: dict[str, list[tuple[float, float]]] = {}
     for row in rows:
         peer = row["pycolmap"]
         best = best_mapper(peer)
@@ -120,21 +150,26 @@ def table_of(rows: Sequence[Row]) -> str:
         block = row["block"] if row["every"] == 1 else f"{row['block']} / {row['every']}"
         errors = [number(one.get("reprojection_error_px") or np.nan, 2) for one in (row, best)]
         lines.append(
-            [block, row["given"], f"`{row['preset']}`", row["images"], row["registered"], row["right"], export, alone,
-             best["right"], row.get("points") or 0, best.get("points", 0), *errors, number(row["seconds"]),
+            [block, row["given"], f"`{row['preset']}`", row["images"], row["registered"], row["correct"], export, alone,
+             best["correct"], row.get("points") or 0, best.get("points", 0), *errors, number(row["seconds"]),
              number(best["seconds"])]
         )  # fmt: skip
-        points.append((row.get("points") or 0, best.get("points", 0)))
-        images.append((row["registered"], max([best.get("registered", 0)] + [row.get(f"by_{m}", 0) for m in MAPPERS])))
-    fewer = sum(own < most for own, most in images)
+        most = max([best.get("registered", 0)] + [row.get(f"by_{m}", 0) for m in MAPPERS])
+        points.setdefault(block, []).append((row.get("points") or 0, best.get("points", 0)))
+        if best.get("registered", 0) == row["registered"]:
+            alike.setdefault(block, []).append(points[block][-1])
+        images.setdefault(block, []).append((row["registered"], most))
+    fewer = sum(own < most for cases in images.values() for own, most in cases)
     parts = [
-        f"Points over pycolmap's, all cases: {_beside(points)}. Images in our model over the most that any mapper "
+        f"Points over pycolmap's, all cases: {_beside(points)}; where it registers as many images by itself: "
+        f"{_beside(alike)}. Images in our model over the most that any mapper "
         f"registers from either: {_beside(images)}; fewer in {fewer} of {len(rows)} cases.",
         markdown(HEADS, lines),
     ]
     return "\n\n".join(parts)
 
 
-def _beside(cases: Sequence[tuple[float, float]]) -> str:
-    """Ratio of sums, with its interval over cases."""
-    return ranged(ratio(*np.sum(cases, axis=0)), interval(cases, ratio_of_sums), 2)
+def _beside(cases: Mapping[str, Sequence[tuple[float, float]]]) -> str:
+    """Ratio of sums, with its interval over thinned blocks: what is given to the same images makes no further case."""
+    sums = np.array([np.sum(own, axis=0) for own in cases.values()]).reshape(-1, 2)
+    return ranged(ratio(*sums.sum(axis=0)), interval(sums, ratio_of_sums), 2)

@@ -30,7 +30,7 @@ from benchmarks.tables import (
 # It registers pairs of pictures from straight above, and is asked for no others.
 NADIR_ONLY = "polar"
 HEADS = (
-    "condition", "method", "blocks", "pairs", "correct", "right", "worst block", "error px", "auto / it", "s",
+    "condition", "method", "blocks", "pairs", "correct", "correctness", "worst block", "error px", "auto / it", "s",
 )  # fmt: skip
 
 
@@ -47,7 +47,7 @@ def by_block(rows: Sequence[Row]) -> Mapping[str, list[Row]]:
     return {block: own for (block,), own in grouped(rows, "block")}
 
 
-def right(rows: Sequence[Row]) -> float:
+def correctness(rows: Sequence[Row]) -> float:
     """Share of the kept matches that is correct."""
     return ratio(total(rows, "correct"), total(rows, "kept"))
 
@@ -71,12 +71,13 @@ def table_of(rows: Sequence[Row]) -> str:
         ours = by_block([row for row in asked if row["method"] == JUDGED])
         for (method,), own in grouped(asked, "method"):
             blocks = by_block(own)
-            worst = min(blocks, key=lambda name, known=blocks: right(known[name]))  # type: ignore[misc]
+            worst = min(blocks, key=lambda name, known=blocks: correctness(known[name]))  # type: ignore[misc]
+            least = percent(correctness(blocks[worst]), 1)
             beside = [row for name in blocks for row in ours[name]]
             kept = [(row["correct"] or 0.0, row["kept"] or 0.0) for row in own]
             lines.append(
                 [condition, code(method), len(blocks), len(own), number(total(own, "correct")),
-                 _percents(right(own), interval(kept, ratio_of_sums)), f"{percent(right(blocks[worst]), 1)} ({worst})",
+                 _percents(correctness(own), interval(kept, ratio_of_sums)), f"{least} ({worst})",
                  number(median(own, "median_error_px"), 2),
                  "" if method == JUDGED else correct_beside(beside, own),
                  number(total(own, "seconds"))]

@@ -1,7 +1,7 @@
 """auto with one strategy more, or another one, beside auto as it is, on the same blocks: whether it belongs into it.
 
-A strategy is worth its place where it brings 2 % more right matches at no lower correctness, or a fifth fewer wrong
-ones for 1 % fewer right ones at most.
+A strategy is accepted where it brings 2 % more correct matches at no lower correctness, or a fifth fewer wrong ones for
+1 % fewer correct ones at most.
 """
 
 from __future__ import annotations
@@ -9,23 +9,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from benchmarks.auto.blocks import ALL, CONDITIONS
-from benchmarks.auto.rendered import by_block, correct_beside, of_condition, right
+from benchmarks.auto.rendered import by_block, correct_beside, correctness, of_condition
 from benchmarks.auto.runs import JUDGED
 from benchmarks.tables import Row, code, grouped, markdown, percent, ratio, total
 
-MORE_RIGHT, FEWER_WRONG, MOST_LOST = 1.02, 0.80, 0.99
-# Of the share of right matches: what counts as equal.
+MORE_CORRECT, FEWER_WRONG, MOST_LOST = 1.02, 0.80, 0.99
+# Of correctness: what counts as equal.
 _EQUAL = 0.001
-WORTH, NOT_WORTH = "in auto", "no gain"
-HEADS = ("strategy", "condition", "blocks", "right / auto's", "wrong / auto's", "correctness", "auto's", "verdict")
+ACCEPTED, NOT_ACCEPTED = "accepted", "not accepted"
+HEADS = ("strategy", "condition", "blocks", "correct / auto's", "wrong / auto's", "correctness", "auto's", "verdict")
 
 
 def verdict(ours: Sequence[Row], arm: Sequence[Row]) -> str:
     """The rule on the sums over the same pairs."""
     more = ratio(total(arm, "correct"), total(ours, "correct"))
     wrong = ratio(total(arm, "wrong"), total(ours, "wrong"))
-    equal = right(arm) >= right(ours) - _EQUAL
-    return WORTH if (more >= MORE_RIGHT and equal) or (wrong <= FEWER_WRONG and more >= MOST_LOST) else NOT_WORTH
+    equal = correctness(arm) >= correctness(ours) - _EQUAL
+    better = (more >= MORE_CORRECT and equal) or (wrong <= FEWER_WRONG and more >= MOST_LOST)
+    return ACCEPTED if better else NOT_ACCEPTED
 
 
 def table_of(rows: Sequence[Row]) -> str:
@@ -42,7 +43,7 @@ def table_of(rows: Sequence[Row]) -> str:
             beside = [row for name in blocks for row in ours[name]]
             lines.append(
                 [code(method), condition, len(blocks), correct_beside(arm, beside),
-                 correct_beside(arm, beside, "wrong"), percent(right(arm), 1), percent(right(beside), 1),
+                 correct_beside(arm, beside, "wrong"), percent(correctness(arm), 1), percent(correctness(beside), 1),
                  verdict(beside, arm)]
             )  # fmt: skip
     return markdown(HEADS, lines)

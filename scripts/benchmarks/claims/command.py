@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> None:
     ]
     rows = made(units, out / "rows", JOBS)
     write_rows(out / "claims.json", rows)
-    text = f"Seed {seed}. {legend()}\n\n{tables(rows)}"
+    text = f"Seed {seed}. The arms:\n\n{legend()}\n\n{tables(rows)}"
     settings = [one for part in (shadow, registration, features) for one in part.settings()]
     versions = stamps.of_settings(*settings, families=[family for family in FAMILIES if family != "export"])
     options.publish(

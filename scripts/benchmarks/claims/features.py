@@ -41,6 +41,16 @@ RIVALS: Mapping[str, str] = {
     "ContextDesc, stand-in": f"oblique[{_AS_TAKEN},extract.detector=sift,extract.context=true]",
 }
 OURS: Mapping[str, str] = {STEP: f"oblique[{_AS_TAKEN}]", RECTIFIED: "opencv-sift@ground", WHOLE: "oblique"}
+ABOUT: Mapping[str, str] = {
+    "SIFT": "OpenCV's, with the ratio test, on the images as taken",
+    "ASIFT": "OpenCV's, the same number of descriptors over all its views",
+    SUPERPOINT: "with the published weights, on the images as taken",
+    "GeoDesc, stand-in": "SIFT keypoints with this project's descriptor, on the images as taken, not guided",
+    "ContextDesc, stand-in": "the same with context in the descriptor",
+    STEP: "this project's keypoints and descriptor, on the images as taken, not guided",
+    RECTIFIED: "OpenCV's SIFT on this project's ground views",
+    WHOLE: "the preset, with guided search",
+}
 RATIOS = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
 TWO_WAY, ONE_WAY = "two-way", "one-way"
 

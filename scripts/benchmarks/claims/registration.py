@@ -18,6 +18,7 @@ from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.strategies.matchers.polar import Polar
 from aeromatch_cli.strategies.matchers.polar.fit import Fit, Grid, fit, polar_grid
+from aeromatch_cli.strategies.matchers.polar.level import Level
 from aeromatch_cli.strategies.matchers.polar.pyramid import FINEST_PX, rescaled
 from benchmarks.claims.grounds import GROUNDS, KnownPair, differences, errors, ground, known_pair, turn_deg
 from benchmarks.claims.sides import PolarResult, Shot, SiftResult, registered, sift, unknown_geometry
@@ -149,6 +150,16 @@ def cartesian(radius_px: int, step_px: float) -> FloatArray:
 LAYOUTS: Mapping[str, Grid | None] = {"dynamic polar": None, "plain polar": plain_polar, "Cartesian": cartesian}
 
 
+def equal_samples(levels: tuple[Level, Level], truth: FloatArray) -> dict[str, int]:
+    """Layout -> samples to ask `fit` for, so that of all layouts as many lie in both pictures: those of the plain polar
+    grid crowd in the middle of the overlap, and fewer of them fall outside."""
+    used = {layout: fit(*levels, truth, samples=SAMPLES, grid=grid) for layout, grid in LAYOUTS.items()}
+    wanted = used["dynamic polar"]
+    if wanted is None:
+        return dict.fromkeys(LAYOUTS, SAMPLES)
+    return {layout: round(SAMPLES * wanted.samples / one.samples) if one else SAMPLES for layout, one in used.items()}
+
+
 def grid_rows(kind: str, seed: int) -> list[Row]:
     """Least squares on the finest level from starts a little and farther off, on every layout of samples."""
     source = ground(kind, GRID_SIZE, seed)
@@ -161,12 +172,13 @@ def grid_rows(kind: str, seed: int) -> list[Row]:
             continue
         levels, scale = found.levels.at(FINEST_PX, even=False), found.levels.scale(FINEST_PX)
         truth = rescaled(pair.truth, 1.0, scale)
+        asked = equal_samples(levels, truth)
         rng = np.random.default_rng([seed, 7, number])
         way = rng.uniform(0.0, 2.0 * np.pi)
         for distance, off in (("near", _NEAR), ("far", _FAR)):
             start = _off(truth, off, way, levels[0].size_px)
             for layout, grid in LAYOUTS.items():
-                done = fit(*levels, start, samples=SAMPLES, grid=grid)
+                done = fit(*levels, start, samples=asked[layout], grid=grid)
                 head = {"paper": "B", "section": "grid", "kind": kind, "pair": number, "start": distance}
                 rows.append(head | {"layout": layout} | _fitted(done, truth, scale, pair, shots[0]))
     return rows

@@ -14,15 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aeromatch_cli.config import Settings, load, parse_method
 from aeromatch_cli.data import BoolArray, Candidates, FloatArray, PairGeometry
 from aeromatch_cli.evaluate.metrics import thin
 from aeromatch_cli.evaluate.scores import CORRECT_PX
-from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.lab.strategies.homography import Homography
-from aeromatch_cli.lab.synthetic.sensor import Development, tone
 from aeromatch_cli.lab.synthetic.write import IN_SHADOW_BELOW
 from aeromatch_cli.stages import filter as filtering
 from aeromatch_cli.strategies.filters import apply_chain
@@ -30,15 +27,17 @@ from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
 from aeromatch_cli.strategies.filters.colour import Colour
 from aeromatch_cli.strategies.filters.epipolar import Epipolar
 from benchmarks.claims.work import Unit, rendered
+from benchmarks.exposure import write_under_exposed
 from benchmarks.peers.base import Options
 from benchmarks.peers.ours import Preset
 from benchmarks.scenes import Judged
 from benchmarks.sources import OUR_CODE
 from benchmarks.tables import Row
 
-CODE = (*OUR_CODE, "lab/synthetic", "evaluate", "benchmarks/claims/shadow.py")
+CODE = (*OUR_CODE, "lab/synthetic", "evaluate", "benchmarks/claims/shadow.py", "benchmarks/exposure.py")
 SCENES = ("city", "suburb")
 SIZE, IMAGES, KEYPOINTS = "800x600", 12, 2048
+# LightGlue on every pair, on all keypoints, without guided search: no pair has so many matches that it goes without.
 _MATCHER = (
     "match.guided=false,match.only_overlap=false,match.network_below_matches=100000,match.guide_below_matches=100000"
 )
@@ -51,6 +50,14 @@ ARMS: Mapping[str, str] = {
     STEP: f"fusion[{_MATCHER}]",
     WHOLE: "fusion",
     PLAIN: "fusion[enhance=none]",
+}
+ABOUT: Mapping[str, str] = {
+    PAPER: "the paper's baseline: SIFT on the images as taken, LightGlue on every pair, all keypoints, not guided",
+    SHADOW: "the same, features of pictures with enhanced shadow, too",
+    VIEWS: "the baseline on simulated views",
+    STEP: "the baseline with both",
+    WHOLE: "the preset, with guided search, and LightGlue where matches are few",
+    PLAIN: "the preset without enhancement",
 }
 # On under-exposed pictures the question is what enhancement brings.
 DARK_ARMS = (PAPER, SHADOW, WHOLE, PLAIN)
@@ -97,10 +104,7 @@ def scene_of(scene: str, seed: int, pairs: int, out: Path, *, dark: bool = False
 
 
 def under_exposed(judged: Judged, seed: int) -> Judged:
-    """The same pairs of pictures taken with 0.06 of the light: cast shadow keeps a few levels, and less contrast than
-    noise. Made from the rendered pictures, whose own noise is small against this."""
-    import cv2
-
+    """The same pairs of pictures taken with 0.06 of the light."""
     source = judged.scene.images
     images = source.parent / "under_exposed"
     if not images.is_dir():
@@ -108,19 +112,10 @@ def under_exposed(judged: Judged, seed: int) -> Judged:
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir()
         for order, path in enumerate(sorted(source.iterdir())):
-            pixels = darkened(read_pixels(path, colour=True), np.random.default_rng([seed, _STREAM, order]))
-            cv2.imwrite(str(scratch / path.name), pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+            rng = np.random.default_rng([seed, _STREAM, order])
+            write_under_exposed(path, scratch / path.name, UNDER_EXPOSED, rng)
         scratch.rename(images)
     return replace(judged, scene=replace(judged.scene, images=images), key=f"{judged.key} under-exposed")
-
-
-def darkened(pixels: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) as the renderer's camera stores so little light, by its noise and tone curve."""
-    camera = Development(UNDER_EXPOSED)
-    stored = tone(np.linspace(0.0, 1.0, 4097))
-    light = camera.exposure * np.interp(np.arange(256) / 255.0, stored, np.linspace(0.0, 1.0, 4097))[pixels]
-    sigma = np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * light)
-    return np.rint(255.0 * tone(light + sigma * rng.standard_normal(light.shape))).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

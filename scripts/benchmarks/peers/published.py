@@ -7,12 +7,14 @@ IEEE TIM 2023; Tyszkiewicz et al., DISK, NeurIPS 2020; Potje et al., XFeat and L
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.loading import check_same_tensors
 from benchmarks.peers.base import Described, Found, Options, Scene, found, read_colour, read_weights, size_of, strongest
 from benchmarks.peers.matching import Peer, magsac
 
@@ -21,6 +23,12 @@ _LIGHTERGLUE: Mapping[str, Any] = {
     "input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1, "depth_confidence": -1,
     "width_confidence": 0.95,
 }  # fmt: skip
+
+
+# Made from the number of layers; files may have it or not.
+_DERIVED = frozenset({"confidence_thresholds"})
+# DISK's file has a value of each layer that no code reads, LighterGlue's the whole of XFeat beside.
+_NOT_READ = re.compile(r"log_assignment\.\d+\.r|extractor\..*")
 
 
 class Disk(Peer):
@@ -94,9 +102,12 @@ class WithLightGlue:
         self.scene, self.peer = scene, features(scene, options)
         self.network: Any = LightGlue(features=None, **settings)
         tensors = _renamed(read_weights(options, weights), self.network.conf.n_layers)
-        missing, _ = self.network.load_state_dict(tensors, strict=False)  # DISK's has nine values that nothing reads
-        if lacking := [name for name in missing if name in dict(self.network.named_parameters())]:
-            raise ConfigError(f"{weights} does not fit kornia's LightGlue: it lacks {lacking}")
+        own = self.network.state_dict()
+        try:
+            check_same_tensors(own, tensors, _DERIVED)
+        except ValueError as error:
+            raise ConfigError(f"{weights} does not fit kornia's LightGlue: {error}") from error
+        self.network.load_state_dict({name: own[name] for name in _DERIVED} | tensors, strict=True)
         self.network.eval()
 
     def features(self, image: str) -> Described:
@@ -131,8 +142,8 @@ def _side(features: Described) -> dict[str, Any]:
 
 
 def _renamed(tensors: Mapping[str, Any], layers: int) -> dict[str, Any]:
-    """Published weights by kornia's names."""
-    named = {key.removeprefix("matcher."): tensor for key, tensor in tensors.items()}
+    """Published weights by kornia's names, without what LightGlue does not read."""
+    named = {key.removeprefix("matcher."): one for key, one in tensors.items() if not _NOT_READ.fullmatch(key)}
     for layer in range(layers):
         for part in ("self_attn", "cross_attn"):
             old, new = f"{part}.{layer}.", f"transformers.{layer}.{part}."
