@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from aeromatch_cli import graph
 from aeromatch_cli.results.stages import BlockResults, ConsistencyResult
-from aeromatch_cli.sfm.quality.finding import LEVELS, Finding, Limits, Quality, QualityInput, finding_of
+from aeromatch_cli.sfm.quality.finding import Quality, QualityInput
 from aeromatch_cli.sfm.quality.judgement import judged
 from aeromatch_cli.stages.first_pass import ALL_PAIRS_UP_TO
-from aeromatch_cli.stages.messages import listed
 from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.workspace import Workspace
 
 # Tie points count as measured by least squares where at least this share of them was.
 _MEASURED = 0.5
-# Share of the images that could not be read: none is as it should be.
-_UNREAD: Limits = (0.0, 0.2)
-# Advice that is no use where positions have chosen no pairs.
-HIDDEN_PAIRS = "; --set pairs=exhaustive finds pairs that positions hide"
 
 
 def quality_of(results: BlockResults, names: Mapping[str, str]) -> Quality | None:
@@ -30,7 +24,7 @@ def quality_of(results: BlockResults, names: Mapping[str, str]) -> Quality | Non
     consistency, unread = results.consistency, links.unread
     # What could not be read is a fault of its own, and none of how the others hang together.
     outside = {image_id: reason for image_id, reason in adjust.outside.items() if image_id not in unread}
-    quality = judged(
+    return judged(
         QualityInput(
             images=len(names) - len(unread),
             adjust=adjust.model_copy(update={"outside": outside}),
@@ -41,23 +35,10 @@ def quality_of(results: BlockResults, names: Mapping[str, str]) -> Quality | Non
             refined=refined is not None and (refined.measured or 0) > _MEASURED * (refined.keypoints or 1),
             reduced=adjust.reduced,
             names=dict(names),
+            unread=tuple(unread),
+            hidden_pairs=_positions_hide_pairs(results, len(names) - len(unread)),
         )
     )
-    findings = list(quality.findings)
-    if not _positions_hide_pairs(results, len(names) - len(unread)):
-        findings = [replace(one, sentence=one.sentence.removesuffix(HIDDEN_PAIRS)) for one in findings]
-    if unread:
-        findings.append(_unread([names.get(i, i) for i in unread], len(names)))
-    findings.sort(key=lambda one: -LEVELS.index(one.level))
-    return Quality(findings[0].level if findings else "good", tuple(findings), quality.unchecked)
-
-
-def _unread(unread: Sequence[str], images: int) -> Finding:
-    """Judge how many images could not be read. unread: names of their files."""
-    verb = "is" if len(unread) == 1 else "are"
-    words = f"{len(unread)} of {images} images {verb} not in the block, since the pictures could not be read"
-    remedy = f"replace or remove {listed(unread, 5)}; failures.csv says why"
-    return finding_of("unread images", len(unread) / images, _UNREAD, words, remedy)
 
 
 def _positions_hide_pairs(results: BlockResults, images: int) -> bool:

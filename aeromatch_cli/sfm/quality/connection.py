@@ -43,8 +43,19 @@ def connection(evidence: QualityInput) -> Iterator[Finding]:
         return
     shown = ", ".join(map(str, sizes[:5])) + (", ..." if len(sizes) > 5 else "")
     words = f"{len(sizes)} groups of images ({shown}) that no verified pair connects"
-    remedy = "more overlap between them helps; --set pairs=exhaustive finds pairs that positions hide"
-    yield finding_of("connection", beside, _LEFT_OUT, words, remedy)
+    hidden = "; --set pairs=exhaustive finds pairs that positions hide" if evidence.hidden_pairs else ""
+    yield finding_of("connection", beside, _LEFT_OUT, words, f"more overlap between them helps{hidden}")
+
+
+def unread(evidence: QualityInput) -> Iterator[Finding]:
+    """Judge how many images could not be read."""
+    if not evidence.unread:
+        return
+    lacking, images = len(evidence.unread), evidence.images + len(evidence.unread)
+    verb = "is" if lacking == 1 else "are"
+    words = f"{lacking} of {images} images {verb} not in the block, since the pictures could not be read"
+    remedy = f"replace or remove {evidence.named(evidence.unread)}; failures.csv says why"
+    yield finding_of("unread images", lacking / images, _LEFT_OUT, words, remedy)
 
 
 def left_out(evidence: QualityInput) -> Found:

@@ -60,7 +60,8 @@ class QualityInput(Record):
     verified pairs connect, the largest first. refined: whether tie points were measured by least squares. contradicted:
     share of the verified matches that the adjusted block contradicts, None where it is not known; contradicting: ids of
     images of which it contradicts most. reduced: stored pixels in a pixel of the pictures that keypoints were found in.
-    names: of the files, by image_id.
+    names: of the files, by image_id. unread: ids of images beside these whose pictures could not be read. hidden_pairs:
+    whether given positions have kept pairs from being compared.
     """
 
     images: int
@@ -72,6 +73,8 @@ class QualityInput(Record):
     contradicting: tuple[str, ...] = ()
     reduced: float = 1.0
     names: dict[str, str] = Field({})
+    unread: tuple[str, ...] = ()
+    hidden_pairs: bool = False
 
     @property
     def groups(self) -> Sequence[GroupResult]:

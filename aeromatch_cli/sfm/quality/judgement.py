@@ -8,7 +8,15 @@ the ground.
 from __future__ import annotations
 
 from aeromatch_cli.sfm.quality.calibration import calibration
-from aeromatch_cli.sfm.quality.connection import connection, contradicted, frames, kept_poses, left_out, weak_ties
+from aeromatch_cli.sfm.quality.connection import (
+    connection,
+    contradicted,
+    frames,
+    kept_poses,
+    left_out,
+    unread,
+    weak_ties,
+)
 from aeromatch_cli.sfm.quality.deformation import deformation
 from aeromatch_cli.sfm.quality.finding import LEVELS, Finding, Quality, QualityInput
 from aeromatch_cli.sfm.quality.image_points import multiplicity, reprojection_errors
@@ -18,7 +26,7 @@ from aeromatch_cli.sfm.quality.surveyed_points import control_points
 
 def judged(evidence: QualityInput) -> Quality:
     """Return the verdict on a block, and what it rests on."""
-    findings, unchecked = [*connection(evidence)], list[str]()
+    findings, unchecked = [*connection(evidence), *unread(evidence)], list[str]()
     if evidence.adjust.images:
         for criterion in (
             left_out, frames, weak_ties, contradicted, positions, flights, mounts, angles, control_points,
