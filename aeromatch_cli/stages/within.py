@@ -34,8 +34,11 @@ _SHARES = (1.0, 1 / 2, 1 / 4, 1 / 8)
 _LEAST_KEYPOINTS, _LEAST_SIZE_PX = 500, 1600
 # Share of the time that is planned for: a pair and its images do not tell exactly what the others need.
 _PLANNED = 0.9
-# Share of the time that must be saved by having fewer pixels and keypoints: where they cost little they stay.
+# Share of the time that fewer pixels and keypoints, or a step left out after its trial, must save: what costs little
+# stays.
 _WORTH = 0.05
+# What workers take to load a network.
+_NETWORK_S = 3.0
 
 
 def seconds_of(text: str) -> float:
@@ -76,12 +79,14 @@ class Deadline:
         """Whether so many seconds more are planned for: the one rule by which all is taken or left out."""
         return self.spent_s + more_s <= _PLANNED * self.seconds
 
+    def is_worth(self, saved_s: float) -> bool:
+        """Whether it is worth while to do without what takes so many seconds."""
+        return saved_s >= _WORTH * self.seconds
+
     def plan(self) -> str:
         """Say what is left out from the start."""
-        aim = f"to end in {self.text}"
-        return f"within           {f'too short {aim}, as early as it can' if self.short else aim}: " + "; ".join(
-            self.left_out
-        )
+        aim = f"{self.text} is too short; to end as early as it can" if self.short else f"to end in {self.text}"
+        return f"within           {aim}: {'; '.join(self.left_out)}"
 
     def line(self) -> str:
         """Say at the end of the run when it ended, and what it did without."""
@@ -185,7 +190,7 @@ def fitting(context: Context, deadline: Deadline) -> Settings | None:
         for option in smaller:
             if deadline.holds(chosen.seconds(tried)):
                 break
-            if chosen.seconds(tried) - option.seconds(tried) >= _WORTH * deadline.seconds:
+            if deadline.is_worth(chosen.seconds(tried) - option.seconds(tried)):
                 chosen = option
         deadline.short = not deadline.holds(chosen.seconds(tried))
     deadline.left_out += chosen.left_out
@@ -247,20 +252,22 @@ def steps_in_time(context: Context, deadline: Deadline) -> list[StepContext]:
 
 
 def _fits(step: StepContext, first: StepContext, deadline: Deadline) -> bool:
-    """Whether there is time for a step. It is tried on a pair only if there would be time where it took no longer than
-    the first step, which is cheaper, did in this run."""
+    """Whether there is time for a step. It is tried on a pair, whose features stay on file, only if there would be time
+    where its images and pairs took no longer than those of the first step, which is cheaper, did in this run."""
     context, later_s = step.context, _later_s(first.context, _keypoints(first.context))
     todo = _Todo.of(context, step.images)
     if not todo.images and not todo.pairs:
         return True
     image_s, pair_s = (report.seconds * todo.jobs / max(report.done, 1) for report in first.reports[:2])
-    if not deadline.holds(todo.seconds(image_s, pair_s) + later_s):
+    start_s = _NETWORK_S * bool(todo.images and context.settings.extract.network)
+    if not deadline.holds(start_s + todo.seconds(image_s, pair_s) + later_s):
         return False
     pairs = [pair for row in context.rows().values() for pair in row]
     tried = tried_pair(context, todo.sample(todo.pairs or pairs), keep=True)
     if tried is None:  # its images cannot be read; the stages say so
         return True
-    return deadline.holds(_Todo.of(context, step.images).seconds(tried.image_s, tried.pair_s) + later_s)
+    rest_s = _Todo.of(context, step.images).seconds(tried.image_s, tried.pair_s)
+    return deadline.holds(rest_s + later_s) or not deadline.is_worth(rest_s)
 
 
 def _pairs(count: int) -> str:
