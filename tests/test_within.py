@@ -157,7 +157,7 @@ def test_without_time_for_the_images_none_is_tried(done_site: Site, monkeypatch:
     assert _keypoints(plan(context, deadline, _tried(0.0, 0.0))) == SMALLEST
     assert (deadline.short, plan.tried) == (True, 0)
     assert deadline.plan() == (
-        "within           100s is too short; to end as early as it can: 500 keypoints per image instead of 4000"
+        "within           100s is likely too short; to end as early as it can: 500 keypoints per image instead of 4000"
     )
 
 

@@ -156,7 +156,8 @@ def tried_pair(context: Context, pair: Pair, *, keep: bool = False) -> TriedPair
     again. A trial of settings that the run goes on with takes no time from it then, but for the pair.
     """
     store = context.store
-    known = BlockState.of(context).with_features(pair.ids) if keep else set[str]()
+    anew = context.scope.overwrite or not keep
+    known = set[str]() if anew else BlockState.of(context).with_features(pair.ids)
     tasks = [extract.task_of(context, image_id) for image_id in pair.ids if image_id not in known]
     trials = [ImageTrial(task, sample=True, keep=keep and store.features(task.image_id) is None) for task in tasks]
     outcomes = context.executor.run(try_image, trials, "trial", network=context.settings.extract.network)

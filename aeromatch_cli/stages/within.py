@@ -7,6 +7,7 @@ page are taken as long as what they need is expected to fit as well. Nothing tha
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Collection
@@ -27,8 +28,8 @@ from aeromatch_cli.strategies.refiners import REFINERS
 
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _PART = r"(\d+(?:\.\d+)?)\s*(s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?)"
-# Shares of the pixels and keypoints that are planned with, until what follows fits.
-_SHARES = (1.0, 1 / 2, 1 / 4, 1 / 8)
+# Shares of the pixels and keypoints that are planned with one after the other, until what follows fits.
+_SMALLER = (1 / 2, 1 / 4, 1 / 8)
 # What they do not fall below: keypoints of an image, and its longer side where there is no first pass whose images
 # would be larger.
 _LEAST_KEYPOINTS, _LEAST_SIZE_PX = 500, 1600
@@ -85,7 +86,7 @@ class Deadline:
 
     def plan(self) -> str:
         """Say what is left out from the start."""
-        aim = f"{self.text} is too short; to end as early as it can" if self.short else f"to end in {self.text}"
+        aim = f"{self.text} is likely too short; to end as early as it can" if self.short else f"to end in {self.text}"
         return f"within           {aim}: {'; '.join(self.left_out)}"
 
     def line(self) -> str:
@@ -109,8 +110,11 @@ class _Todo:
     def of(cls, context: Context, image_ids: Collection[str]) -> _Todo:
         state, anew = BlockState.of(context), context.scope.overwrite
         images = frozenset(image_ids) - (set() if anew else state.with_features(image_ids))
-        rows = (pair for row in context.rows().values() for pair in row)
-        return cls(images, tuple(p for p in rows if anew or not state.are_matched(p)), context.executor.jobs)
+        pairs = list[Pair]()
+        for image_id0, row in context.rows().items():
+            made_of = {} if anew else {i: known.fingerprint for i, known in context.store.matches(image_id0).items()}
+            pairs += [p for p in row if p.image_id1 not in made_of or made_of[p.image_id1] != state.wanted_matches(p)]
+        return cls(images, tuple(pairs), context.executor.jobs)
 
     def seconds(self, image_s: float, pair_s: float) -> float:
         return (len(self.images) * image_s + len(self.pairs) * pair_s) / self.jobs
@@ -119,7 +123,8 @@ class _Todo:
         """The pair that is tried: of those with most images to be made the middle one, whose cost is likely to be that
         of others."""
         lacking = [len(self.images & set(pair.ids)) for pair in pairs]
-        best = [pair for pair, count in zip(pairs, lacking, strict=True) if count == max(lacking)]
+        most = max(lacking)
+        best = [pair for pair, count in zip(pairs, lacking, strict=True) if count == most]
         return best[len(best) // 2]
 
 
@@ -157,7 +162,8 @@ class _Option:
             block = with_gsd(block, (block.gsd_m, block.reduced_gsd_m), size_px)
         first = _first(replace(context, settings=settings, block=block) if update else context)
         todo = _Todo.of(first, [image.image_id for image in block.images])
-        return cls(settings, first, todo, (size_px / before_px) ** 2, float(count), tuple(left_out))
+        keypoints = float(count) if name else math.inf
+        return cls(settings, first, todo, (size_px / before_px) ** 2, keypoints, tuple(left_out))
 
     def seconds(self, tried: TriedPair) -> float:
         """What is to be made of the images and pairs, and what follows. tried: with the settings as asked for. Features
@@ -173,23 +179,22 @@ def fitting(context: Context, deadline: Deadline) -> Settings | None:
 
     What is on file counts as done: where the features are there, nothing is reduced, as all would be made anew.
     """
-    asked, *smaller = (_Option.of(context, share) for share in _SHARES)
-    chosen = asked
+    asked = chosen = _Option.of(context, 1.0)
     if not asked.todo.images:
         return None
     started = len(asked.todo.images) < len(context.block.images)
-    if not started and not deadline.holds(_least_s(context) + _later_s(smaller[-1].first, smaller[-1].keypoints)):
-        chosen, deadline.short = smaller[-1], True  # and no time is spent on a trial
+    if not started and not deadline.holds(_least_s(context) + _later_s(context, _LEAST_KEYPOINTS)):
+        chosen, deadline.short = _Option.of(context, _SMALLER[-1]), True  # and no time is spent on a trial
     else:
         tried = tried_pair(asked.first, asked.todo.sample(context.pairs), keep=True)
         if tried is None:  # its images cannot be read; the stages say so
             return None
-        asked = chosen = replace(
-            asked, todo=_Todo.of(asked.first, asked.todo.images)
-        )  # without what the trial has made
-        for option in smaller:
+        left = _Todo.of(asked.first, asked.todo.images)  # without what the trial has made
+        asked = chosen = replace(asked, todo=left)
+        for share in _SMALLER:
             if deadline.holds(chosen.seconds(tried)):
                 break
+            option = _Option.of(context, share)
             if deadline.is_worth(chosen.seconds(tried) - option.seconds(tried)):
                 chosen = option
         deadline.short = not deadline.holds(chosen.seconds(tried))
@@ -255,7 +260,8 @@ def _fits(step: StepContext, first: StepContext, deadline: Deadline) -> bool:
     """Whether there is time for a step. It is tried on a pair, whose features stay on file, only if there would be time
     where its images and pairs took no longer than those of the first step, which is cheaper, did in this run."""
     context, later_s = step.context, _later_s(first.context, _keypoints(first.context))
-    todo = _Todo.of(context, step.images)
+    images = step.images if step.own_features else ()
+    todo = _Todo.of(context, images)
     if not todo.images and not todo.pairs:
         return True
     image_s, pair_s = (report.seconds * todo.jobs / max(report.done, 1) for report in first.reports[:2])
@@ -266,7 +272,7 @@ def _fits(step: StepContext, first: StepContext, deadline: Deadline) -> bool:
     tried = tried_pair(context, todo.sample(todo.pairs or pairs), keep=True)
     if tried is None:  # its images cannot be read; the stages say so
         return True
-    rest_s = _Todo.of(context, step.images).seconds(tried.image_s, tried.pair_s)
+    rest_s = _Todo.of(context, images).seconds(tried.image_s, tried.pair_s)
     return deadline.holds(rest_s + later_s) or not deadline.is_worth(rest_s)
 
 
