@@ -277,6 +277,7 @@ def test_a_short_time_leaves_out_and_exports_all_the_same(site: Site) -> None:
     assert not (site.work / "report" / "index.html").exists()
     assert (site.work / "export" / "colmap" / "database.db").is_file()
     assert outcome.facts["stages"]["filter"]["result"]["verified_matches"] > 0
+    assert invoke("show", site.work, "--json").facts["left_out"] == outcome.facts["left_out"][:-1]  # all but the page
     shown = invoke("show", site.work).stdout
     assert "left out    to end in time (run --within): 500 keypoints per image instead of 4000; without" in shown
     # The same again loses nothing, and says the same without --json.

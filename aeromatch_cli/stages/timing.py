@@ -29,8 +29,8 @@ from aeromatch_cli.strategies.filters.chain import Filter
 # How much smaller the picture is with which a worker gets ready.
 _WARM_UP_SCALE = 0.25
 # Seconds of a stage, of every image, and of every keypoint that the images have on average: measuring (refine), and
-# adjustment, consistency and export together. Fitted by eye to the reports of 595 runs of 2 to 30 images and one of
-# 1,000, on two cores that were busy with other work to some extent: within a factor of two for most.
+# adjustment, consistency and export together. Set by the reports of 595 runs of 2 to 30 images and of 1,000, on two
+# cores that were more or less busy: half of them took from half to twice as long.
 _MEASURING_S, _ADJUSTING_S = (0.2, 0.02, 0.2 / 8000), (1.5, 0.06, 0.8 / 8000)
 # The report page takes some in any block.
 _PAGE_S = 3.0

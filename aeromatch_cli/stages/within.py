@@ -92,7 +92,7 @@ class Deadline:
     def line(self) -> str:
         """Say at the end of the run when it ended, and what it did without."""
         over_s = self.spent_s - self.seconds
-        late = f", {duration(over_s)} late" if over_s > 0.0 else ""
+        late = f", {duration(over_s)} late" if over_s >= 0.5 else ""
         done = f"for that: {'; '.join(self.left_out)}" if self.left_out else "nothing was left out"
         return f"within {self.text}".ljust(16) + f" ended after {duration(self.spent_s)}{late}; {done}"
 
