@@ -35,8 +35,8 @@ _SMALLER = (1 / 2, 1 / 4, 1 / 8)
 _LEAST_KEYPOINTS, _LEAST_SIZE_PX = 500, 1600
 # Share of the time that is planned for: a pair and its images do not tell exactly what the others need.
 _PLANNED = 0.9
-# Share of the time that fewer pixels and keypoints, or a step left out after its trial, must save: what costs little
-# stays.
+# Share of the time that fewer pixels and keypoints, no measuring, or a step left out after its trial must save: what
+# costs little stays.
 _WORTH = 0.05
 # What workers take to load a network.
 _NETWORK_S = 3.0
@@ -281,9 +281,12 @@ def _pairs(count: int) -> str:
 
 
 def measured_in_time(context: Context, deadline: Deadline) -> Context:
-    """Return the context without the measuring of tie points, where that is not expected to fit."""
-    measures = context.settings.least_squares is not None and not refine.is_current(context)
-    if not measures or deadline.holds(_later_s(context, _keypoints(context))):
+    """Return the context without the measuring of tie points, where that is not expected to fit and takes more than a
+    little."""
+    keypoints = _keypoints(context)
+    if deadline.holds(_later_s(context, keypoints)) or not deadline.is_worth(measuring_s(context, keypoints)):
+        return context
+    if refine.is_current(context):
         return context
     deadline.left_out.append("without the least-squares measuring of tie points (refine)")
     keep_asked(context)
