@@ -154,6 +154,7 @@ class Shown(Line):
     workspace: str | None = None
     images: int | None = None
     pairs: int | None = None
+    left_out: list[str] | None = Field(None, description="Of a workspace: what `run --within` did without.")
     image: str | None = None
     keypoints: int | None = None
     partners: dict[str, int] | None = Field(None, description="Image -> verified matches.")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
 
 # Commands that start anew where no preset is named.
 _WHOLE = ("run", "check")
-# Option -> the only command that takes it.
+# Option -> the only command that takes it; the others do not show it, and say so.
 _OF_ONE_COMMAND = {"deep": "check", "within": "run"}
 # Commands that end with a verdict on the block.
 _JUDGED = ("run", "adjust")
@@ -194,6 +195,9 @@ def stage_command(name: str) -> Callable[..., None]:
             from aeromatch_cli.stages import deep_check
             from aeromatch_cli.stages.run import execute
 
+            for option, given in (("deep", deep), ("within", within is not None)):
+                if given and name != _OF_ONE_COMMAND[option]:
+                    raise ConfigError(f"--{option} belongs to `aeromatch {_OF_ONE_COMMAND[option]}`, not to {name}")
             if deep:
                 if any(value is not None for value in block.values()):
                     raise ConfigError("--deep looks at a workspace alone: leave out all that is said of the block")
@@ -203,6 +207,8 @@ def stage_command(name: str) -> Callable[..., None]:
             if scheduler and executor not in (None, "dask"):
                 raise ConfigError(f"--scheduler is for --executor dask, not {executor}: leave out one of them")
             recipe, say = _recipe(config, name, workspace), said(quiet)
+            if config is not None and recipe != config:
+                say(f"settings         {recipe}: as they were asked for before --within reduced them")
             if config is None and recipe == DEFAULT_PRESET:
                 say(f"preset           {recipe}, no other is named")
             settings = load(
@@ -219,11 +225,21 @@ def stage_command(name: str) -> Callable[..., None]:
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context, strict=strict)
 
-    others = {option for option, command_of in _OF_ONE_COMMAND.items() if name != command_of}
     every = inspect.signature(command, eval_str=True)
-    own = [option for option in every.parameters.values() if option.name not in others]
-    command.__signature__ = every.replace(parameters=own)  # type: ignore[attr-defined]
+    options = [
+        option if _OF_ONE_COMMAND.get(option.name, name) == name else _hidden(option)
+        for option in every.parameters.values()
+    ]
+    command.__signature__ = every.replace(parameters=options)  # type: ignore[attr-defined]
     return command
+
+
+def _hidden(option: inspect.Parameter) -> inspect.Parameter:
+    """The option as it is, but for the help."""
+    kind, (described,) = option.annotation.__origin__, option.annotation.__metadata__
+    described = copy(described)
+    described.hidden = True
+    return option.replace(annotation=Annotated[kind, described])
 
 
 def _check_control(given: Mapping[str, Any], block: BlockSettings) -> None:
@@ -242,12 +258,14 @@ def _check_control(given: Mapping[str, Any], block: BlockSettings) -> None:
 def _recipe(config: str | None, command: str, workspace: Path | None) -> str:
     """What a command follows that names no preset: the workspace's own settings for single stages, else `auto`.
 
-    A whole run of a workspace follows the settings that were asked for where `--within` has reduced them."""
+    A whole run of a workspace, or of its config.yaml, follows the settings that were asked for where `--within` has
+    reduced them."""
     from aeromatch_cli.config import Settings
     from aeromatch_cli.workspace import Workspace
 
     if config is not None:
-        asked = Workspace(Path(config)).asked
+        path = Path(config)
+        asked = Workspace(path.parent if path == Workspace(path.parent).config else path).asked
         return str(asked) if command in _WHOLE and asked.is_file() else config
     own = Workspace(Path(workspace or Settings.model_fields["workspace"].default)).config
     return str(own) if command not in _WHOLE and own.is_file() else DEFAULT_PRESET

@@ -16,12 +16,13 @@ without Python objects; their zip comment is `CRC-32 ` and the checksum (8 hex d
 
 ### config.yaml
 
-The resolved configuration, every default included. `aeromatch run WORK/config.yaml` repeats the run.
+The resolved configuration with which the results are made, every default included. `aeromatch run WORK/config.yaml`, as
+`aeromatch run WORK`, repeats the run; where `asked.yaml` lies beside it, both follow that.
 
 ### asked.yaml
 
-Only after `run --within` has reduced settings or left steps out: the settings as they were asked for.
-`aeromatch run WORK` follows them and makes the rest.
+Only where `run --within` has reduced settings: the settings as they were asked for, written before `config.yaml` has
+the reduced ones. `aeromatch run WORK` follows them and makes the rest.
 
 ### block.json
 

@@ -28,7 +28,14 @@ from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
 from aeromatch_cli.results.record import StageRecord
-from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult, OrientResult
+from aeromatch_cli.results.stages import (
+    AdjustResult,
+    ConsistencyResult,
+    ExportResult,
+    FilterResult,
+    OrientResult,
+    PairsResult,
+)
 from aeromatch_cli.sfm.georeferencing import LOCAL_FLYING_HEIGHT
 from aeromatch_cli.sfm.quality.finding import Quality
 from aeromatch_cli.stages.cascade import feature_workspaces
@@ -111,11 +118,16 @@ def _workspace(work: _Work) -> Shown:
     lines = [*_block_lines(work), *_stage_lines(workspace), *_export_lines(workspace)]
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
+    block = result_on_file(workspace, PairsResult)
+    left_out = [] if block is None else block.left_out
+    if left_out:
+        lines.append(f"left out    to end in time (run --within): {'; '.join(left_out)}")
     lines += _verdict_lines(workspace, quality)
     if workspace.report.is_file():
         lines.append(f"report      {workspace.report}")
     lines.append("one image: aeromatch show WORK IMAGE; a pair: aeromatch show WORK IMAGE IMAGE")
     facts: dict[str, Any] = {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)}
+    facts |= {"left_out": left_out} if left_out else {}
     if quality is not None:
         facts["quality"] = quality.as_facts()
     return Shown(lines, facts)

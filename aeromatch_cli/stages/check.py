@@ -4,30 +4,34 @@ from __future__ import annotations
 
 import math
 import shutil
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.blocks.ground import ConstantGround
-from aeromatch_cli.data import Features, FloatArray, Pair, Pose
-from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.data import Pair, Pose
 from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, MIN_MATCHES, PairPoints, explained_share
 from aeromatch_cli.stages import cascade, extract, first_pass, simulate
 from aeromatch_cli.stages.block import with_gsd
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.driver import PairTask
-from aeromatch_cli.stages.filter import candidates
-from aeromatch_cli.stages.match import compared
 from aeromatch_cli.stages.memory import command_mb, runs_network
 from aeromatch_cli.stages.models import thresholds_px
-from aeromatch_cli.stages.state import BlockState
-from aeromatch_cli.strategies import Matcher
-from aeromatch_cli.strategies.filters import apply_chain
-from aeromatch_cli.strategies.filters.chain import Filter
+from aeromatch_cli.stages.timing import (
+    ImageTrial,
+    Tried,
+    TriedPair,
+    adjusting_s,
+    duration,
+    mean,
+    measuring_s,
+    page_s,
+    time_pairs,
+    tried_pair,
+    try_image,
+)
 from aeromatch_cli.strategies.orienters import FirstPass
 
 # Of what the stages write, measured on blocks of 8 and 9 images of 0.75 megapixels. A match is written before and after
@@ -39,17 +43,12 @@ _BYTES_PER_UNITED, _BYTES_PER_REFINED = 18.0, 20.0
 _BYTES_PER_ADJUSTED, _BYTES_PER_EXPORTED = 25.0, 90.0
 # The page, and the reduced pictures on it, by the pixels of the images up to where these are reduced.
 _BYTES_OF_PAGE, _BYTES_PER_PIXEL, _BYTES_PER_PICTURE = 0.8e6, 0.16, 0.12e6
-# How many pairs are tried, and how much smaller the picture is with which a worker gets ready.
+# How many pairs are tried.
 _SAMPLED_PAIRS = 3
-_WARM_UP_SCALE = 0.25
 # From where images look at the ground in trials, as nothing is known of them.
 _TRIAL_HEIGHT_M = 100.0
 # Seconds of mapping, and per image: measured 0.04 (300 images of 480 x 360) to 0.4 (8 images, and ochota).
 _MAPPING_S, _MAPPING_S_PER_IMAGE = 1.5, 0.15
-# Seconds of measuring, adjustment, consistency and export, per image with few keypoints, and what so many keypoints
-# (and more) add, by two processes: 80 s for 1,000 images with 200 keypoints, 5 to 8 s for 7 to 12 images with 4,000
-# and more (lewis, ochota, seneca). The page takes some in any block.
-_LATER_S, _LATER_S_PER_IMAGE, _LATER_S_OF_KEYPOINTS, _MANY_KEYPOINTS, _PAGE_S = 1.5, 0.06, 0.35, 4000, 3.0
 
 
 @dataclass(frozen=True)
@@ -59,79 +58,6 @@ class Check:
     lines: tuple[str, ...]
     estimate: dict[str, Any]
     failures: tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """An image to decode; `sample`: also find its features, in memory, and time it."""
-
-    task: extract.ExtractTask
-    sample: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _PairTrial:
-    """A pair to match and to judge, in memory."""
-
-    features: tuple[Features, Features]
-    pair: PairTask
-    matcher: Matcher
-    chain: tuple[Filter, ...]
-    sources: tuple[Source, Source] | None
-
-
-@dataclass(frozen=True, eq=False)
-class _Tried:
-    """start_s: what a worker does once (imports, networks). seconds: what every further item takes.
-
-    features: of a sampled image. matches: of a sampled pair, before verification; verified: stored pixels (M, 2) of
-    either image of those that are left.
-    """
-
-    start_s: float
-    seconds: float
-    features: Features | None = None
-    matches: int = 0
-    verified: tuple[FloatArray, FloatArray] = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros((0, 2))))
-
-
-def _try_image(trial: _Trial) -> _Tried:
-    views = trial.task.views
-    started = time.perf_counter()
-    if not trial.sample:
-        read_source(views.enhance.source, colour=False)
-        return _Tried(0.0, time.perf_counter() - started)
-    source = views.enhance.source
-    reduced = replace(views.enhance, source=replace(source, scale=source.scale * _WARM_UP_SCALE))
-    _features(trial, replace(views, enhance=reduced))
-    ready = time.perf_counter()
-    features = _features(trial, views)
-    return _Tried(ready - started, time.perf_counter() - ready, features)
-
-
-def _features(trial: _Trial, views: simulate.SimulateTask) -> Features:
-    pictures, _ = simulate.render(views)
-    source = views.enhance.source
-    return extract.in_stored_frame(trial.task.extractor(source.working_camera, pictures), source.scale)
-
-
-def _try_pair(trial: _PairTrial) -> _Tried:
-    started = time.perf_counter()
-    _match(trial)
-    ready = time.perf_counter()
-    matches, verified = _match(trial)
-    seconds = time.perf_counter() - ready
-    return _Tried(max(ready - started - seconds, 0.0), seconds, matches=matches, verified=verified)
-
-
-def _match(trial: _PairTrial) -> tuple[int, tuple[FloatArray, FloatArray]]:
-    """Return how many matches there are before they are judged, and the places of those that are left."""
-    matches = compared(trial.matcher, trial.features, trial.pair.geometry, trial.sources)
-    sides = [(features.keypoints_px, features.colours) for features in trial.features]
-    judged = candidates(matches, *sides)
-    verdict = apply_chain(trial.chain, judged, trial.pair.geometry, trial.pair.seed)
-    kept = judged.take(np.flatnonzero(verdict.keep))
-    return len(judged), (kept.points0_px, kept.points1_px)
 
 
 def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Check:
@@ -144,16 +70,17 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
     sampled = _sample(context)
     seen = context if oriented else _looking_down(context)
     ids = {image_id for pair in sampled for image_id in (pair.image_id0, pair.image_id1)}
-    trials = [_Trial(extract.make_task(seen, image), image.image_id in ids) for image in images]
+    trials = [ImageTrial(extract.make_task(seen, image), image.image_id in ids) for image in images]
     largest_px = max(map(_pixels, trials))
-    outcomes = context.executor.run(_try_image, trials, "check")
+    outcomes = context.executor.run(try_image, trials, "check")
     failures = tuple((i.name, o.error) for i, o in zip(images, outcomes, strict=True) if o.value is None)
     timed = {
         image.image_id: outcome.value
         for image, outcome in zip(images, outcomes, strict=True)
         if outcome.value is not None and image.image_id in ids
     }
-    estimate = _estimate(context, largest_px, timed, _time_pairs(context, sampled, timed), reading_s)
+    features = {image_id: tried.features for image_id, tried in timed.items() if tried.features is not None}
+    estimate = _estimate(context, largest_px, timed, time_pairs(context, sampled, features), reading_s)
     estimate["readable_images"] = len(images) - len(failures)
     estimate["seconds_to_orient"] = 0.0
     if not oriented:
@@ -164,7 +91,8 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
     estimate["seconds_of_further_steps"] = _further_s(seen, sampled)
     if estimate["seconds"] is not None:
         own_s = estimate["seconds"] - estimate["seconds_to_start"] + (estimate["seconds_to_orient"] or 0.0)
-        estimate["seconds_after_matching"] = round(later_s(context), 1)
+        keypoints = mean([len(found.keypoints_px) for found in features.values()])
+        estimate["seconds_after_matching"] = round(_later_s(context, keypoints), 1)
         estimate["seconds"] = round(estimate["seconds_to_start"] + own_s + estimate["seconds_after_matching"], 1)
     return Check(_lines(context, estimate, len(images) + lost), estimate, failures)
 
@@ -188,14 +116,9 @@ def _looking_down(context: Context) -> Context:
     return replace(context, block=with_gsd(block, (None, None), context.settings.block.max_size_px))
 
 
-def later_s(context: Context, share: float = 1.0) -> float:
-    """Estimate the seconds of what follows matching, with this share of the keypoints."""
-    settings = context.settings
-    adjusts = settings.first_pass is not None and not settings.match.reads_pixels
-    many = min(1.0, share * getattr(settings.extract, "keypoints", 0) / _MANY_KEYPOINTS)
-    per_image_s = _LATER_S_PER_IMAGE + _LATER_S_OF_KEYPOINTS * many
-    adjustment_s = _LATER_S + len(context.block.images) * per_image_s
-    return adjustment_s * adjusts + _PAGE_S * settings.run.report
+def _later_s(context: Context, keypoints: float) -> float:
+    """Seconds of what follows matching. keypoints: of an image, on average."""
+    return measuring_s(context, keypoints) + adjusting_s(context, keypoints) + page_s(context)
 
 
 def _orientation(context: Context, sampled: Sequence[Pair]) -> tuple[float | None, int]:
@@ -253,37 +176,13 @@ def _further_s(context: Context, sampled: Sequence[Pair]) -> float | None:
     return round(every_s / context.executor.jobs, 1)
 
 
-@dataclass(frozen=True, eq=False)
-class TriedPair:
-    """Seconds of an image and of the pair, and its verified matches as in `_Tried`."""
-
-    image_s: float
-    pair_s: float
-    verified: tuple[FloatArray, FloatArray]
-
-
-def tried_pair(context: Context, pair: Pair) -> TriedPair | None:
-    """A trial of one pair and its images; None where these cannot be read."""
-    ids = pair.image_id0, pair.image_id1
-    one = replace(context, pairs=(pair,))
-    trials = [_Trial(extract.task_of(one, image_id), sample=True) for image_id in ids]
-    outcomes = context.executor.run(_try_image, trials, "check")
-    timed = {i: outcome.value for i, outcome in zip(ids, outcomes, strict=True) if outcome.value is not None}
-    if len(timed) < len(ids):
-        return None
-    tried = _time_pairs(one, one.pairs, timed)
-    if not tried:
-        return None
-    return TriedPair(_mean([one.seconds for one in timed.values()]), tried[0].seconds, tried[0].verified)
-
-
 def _sample(context: Context) -> list[Pair]:
     """Pairs at even distances in the list: those of steep and of oblique images cost differently."""
     count = min(_SAMPLED_PAIRS, len(context.pairs))
     return [context.pairs[(2 * k + 1) * len(context.pairs) // (2 * count)] for k in range(count)]
 
 
-def _pixels(trial: _Trial) -> int:
+def _pixels(trial: ImageTrial) -> int:
     """Return the number of pixels that an image is worked on with: its own, reduced as the settings ask, or those of
     all its views."""
     views = simulate.views_of(trial.task.views)
@@ -294,38 +193,18 @@ def _pixels(trial: _Trial) -> int:
     return max(working.width_px * working.height_px, sum(view.width_px * view.height_px for view in views))
 
 
-def _time_pairs(context: Context, sampled: Sequence[Pair], timed: Mapping[str, _Tried]) -> list[_Tried]:
-    """The sampled pairs both images of which could be tried, matched and judged as a run does it: in the workers.
-
-    In this process, whose libraries use every core, the same takes up to ten times as long on a busy machine.
-    """
-    trials = []
-    for pair in sampled:
-        found = [timed[i].features for i in (pair.image_id0, pair.image_id1) if i in timed]
-        features0, features1 = found if len(found) == 2 else (None, None)
-        if features0 is not None and features1 is not None:
-            task = PairTask(context.geometry(pair), "", ("", ""), BlockState.of(context).seed(pair))
-            settings = context.settings
-            shown = None
-            if settings.match.reads_pixels:
-                tasks = [extract.task_of(context, image_id) for image_id in (pair.image_id0, pair.image_id1)]
-                shown = tasks[0].views.enhance.source, tasks[1].views.enhance.source
-            trials.append(_PairTrial((features0, features1), task, settings.match, settings.filter, shown))
-    return [o.value for o in context.executor.run(_try_pair, trials, "check") if o.value is not None]
-
-
 def _estimate(
-    context: Context, largest_px: int, images: Mapping[str, _Tried], pairs: Sequence[_Tried], reading_s: float
+    context: Context, largest_px: int, images: Mapping[str, Tried], pairs: Sequence[Tried], reading_s: float
 ) -> dict[str, Any]:
     """largest_px: of the image, or its views, that needs most memory. images, pairs: the sampled ones."""
     count, jobs = len(context.block.images), context.executor.jobs
     stored_px = max(image.width_px * image.height_px for image in context.block.images)
-    seconds_image = _mean([tried.seconds for tried in images.values()])
-    seconds_pair = _mean([tried.seconds for tried in pairs])
+    seconds_image = mean([tried.seconds for tried in images.values()])
+    seconds_pair = mean([tried.seconds for tried in pairs])
     found = [tried.features for tried in images.values() if tried.features]
     descriptors = max((len(features.descriptors) for features in found), default=0)
     keypoints = max((len(features.keypoints_px) for features in found), default=0)
-    matches = _mean([tried.matches for tried in pairs])
+    matches = mean([tried.matches for tried in pairs])
     disk = _disk_bytes(context, count * keypoints, count * descriptors, len(context.pairs) * matches)
     # Workers start side by side; the pairs of one image are one task.
     starts = sum(max((tried.start_s for tried in group), default=0.0) for group in (images.values(), pairs))
@@ -362,10 +241,6 @@ def _disk_bytes(context: Context, keypoints: float, descriptors: float, matches:
     return total
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else 0.0
-
-
 def _existing(path: Path) -> Path:
     while not path.exists():
         path = path.parent
@@ -377,7 +252,10 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
     needed = "unknown (the sample could not be read)" if seconds is None else f"about {duration(seconds)}"
     further_s, names = estimate["seconds_of_further_steps"], " and ".join(s.name for s in context.settings.cascade)
     orient_s = estimate["seconds_to_orient"] or 0.0
-    orienting = f"orient    about {duration(orient_s)} of that; pairs above are those of the poses as they are given"
+    orienting = (
+        f"orient    about {duration(orient_s)} of that, more where the first pass is poor; pairs above are those of "
+        "the poses as they are given"
+    )
     return (
         f"images    {estimate['readable_images']} of {images} readable",
         f"pairs     {estimate['pairs']}",
@@ -387,10 +265,3 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
         f"memory    about {estimate['memory_mb']} MB with {context.executor.jobs} jobs",
         f"disk      about {estimate['disk_mb']} MB needed, {estimate['disk_free_mb']} MB free",
     )
-
-
-def duration(seconds: float) -> str:
-    """Say how long something takes."""
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -28,6 +28,8 @@ _CHECKED = {"check points": "check points", "leave one out": "each control point
 
 def stage_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
     """Counts and time of a stage, and what it found. names: of the files, by image_id. part: of a shard."""
+    if isinstance(stage.result, RefineResult) and not stage.items:
+        return [f"{stage.stage:<11} not done"]
     counts = (
         f"{stage.part + stage.stage:<11} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
         f"{len(stage.failures)} failed, {stage.seconds:.1f} s"

@@ -58,7 +58,7 @@ def run(context: Context) -> StageReport:
         return report.write(context.workspace)
     context, _ = BlockState.of(context).with_current_pairs()
     report.items = len(context.block.images)
-    report.fingerprint = fingerprint(*_versions(), recipe, BlockState.of(context).inputs_fingerprint("refine"))
+    report.fingerprint = _fingerprint(context, recipe)
     if _is_up_to_date(context, report):
         return report.write(context.workspace)
     _make_room(context)
@@ -69,6 +69,18 @@ def run(context: Context) -> StageReport:
     report.done = report.items - len(report.failures)
     report.record_files(context, folder.glob("*.npz"))
     return report.write(context.workspace)
+
+
+def is_current(context: Context) -> bool:
+    """Whether what is on file is of the pairs whose results are up to date; also where nothing is measured, False."""
+    recipe, record = context.settings.least_squares, context.recorded("refine")
+    if recipe is None or record is None:
+        return False
+    return record.fingerprint == _fingerprint(BlockState.of(context).with_current_pairs()[0], recipe)
+
+
+def _fingerprint(context: Context, recipe: LeastSquares) -> str:
+    return fingerprint(*_versions(), recipe, BlockState.of(context).inputs_fingerprint("refine"))
 
 
 def _is_up_to_date(context: Context, report: StageReport) -> bool:

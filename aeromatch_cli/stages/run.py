@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from aeromatch_cli import graph, report
-from aeromatch_cli.config import Settings, dump
+from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.files import remove_stale_temporaries, translated_os_errors, write_text
+from aeromatch_cli.files import remove_stale_temporaries, translated_os_errors
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
@@ -49,7 +49,14 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.stages.within import Deadline, fitting, measured_in_time, page_in_time, steps_in_time
+from aeromatch_cli.stages.within import (
+    Deadline,
+    fitting,
+    keep_asked,
+    measured_in_time,
+    page_in_time,
+    steps_in_time,
+)
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace, locked
 
@@ -222,17 +229,20 @@ def _attempt(asked: _Asked) -> Result:
     )  # fmt: skip
     if dry:
         return _check(context, reports[0], reports[-1], said)
+    if command == "run":  # config.yaml has by now what was asked for
+        with translated_os_errors(workspace.asked):
+            workspace.asked.unlink(missing_ok=True)
     if deadline is not None:
         deadline.left_out.clear()  # of an attempt that met a damaged file
         if smaller := fitting(context, deadline):
-            said(f"within           to end in {deadline.text}: {'; '.join(deadline.left_out)}")
+            said(deadline.plan())
+            keep_asked(context)
             context, _, reports[-1] = pairs.prepare(
                 smaller, asked.executor, index=asked.index, exports=exports, again=True
             )
             context = context.with_scope(overwrite=asked.overwrite)
     if command == "run":
         reports += _run_all(context, reports[-1], deadline)
-        _keep_asked(workspace, settings, deadline)
     elif context.settings.cascade and command in _AFTER_CASCADE:
         context, made = _cascaded(context) if command == "match" else (_joined(context), [])
         reports += made
@@ -261,17 +271,9 @@ def _timed(result: Result, deadline: Deadline | None) -> Result:
     """The result with what `--within` has left out."""
     if deadline is None:
         return result
-    facts = {**result.facts, "left_out": deadline.left_out}
-    return replace(result, lines=(*result.lines, deadline.line()), facts=facts)
-
-
-def _keep_asked(workspace: Workspace, settings: Settings, deadline: Deadline | None) -> None:
-    """Keep the settings that were asked for where `--within` has reduced them, for `aeromatch run WORK`."""
-    if deadline is not None and deadline.left_out:
-        write_text(workspace.asked, dump(settings))
-    else:
-        with translated_os_errors(workspace.asked):
-            workspace.asked.unlink(missing_ok=True)
+    facts, line = {**result.facts, "left_out": deadline.left_out}, deadline.line()
+    urgent = result.urgent if deadline.is_kept else (*result.urgent, line)
+    return replace(result, lines=(*result.lines, line), facts=facts, urgent=urgent)
 
 
 def _there(settings: Settings) -> bool:
@@ -311,14 +313,19 @@ def _run_all(context: Context, read: StageReport, deadline: Deadline | None) -> 
             raise InputError(
                 f"no pair could be verified: the table of pairs in {context.workspace.report} says why"
                 + _without_keypoints(context)
+                + (f"; this run was reduced: {'; '.join(deadline.left_out)}" if deadline and deadline.left_out else "")
             )
         if deadline is not None:
             context = measured_in_time(context, deadline)
         _tell_left_out(context, read, [] if deadline is None else deadline.left_out)
         after = graph.RUN[graph.RUN.index("filter") + 1 :]
         reports += [FUNCTIONS[name](context) for name in after if name != "report"]
-        if context.settings.run.report if deadline is None else page_in_time(context, deadline):
-            reports.append(_page(context))
+        if context.settings.run.report:
+            page = report.page_if_up_to_date(context)
+            if page is None and (deadline is None or page_in_time(context, deadline)):
+                with context.executor.step("report"):
+                    page = report.run(context)
+            reports += [] if page is None else [page]
     return reports
 
 
@@ -340,14 +347,6 @@ def _without_keypoints(context: Context) -> str:
     masks = context.settings.block.masks
     hidden = f"; do the masks {masks} hide them? white is used, black is ignored" if masks else ""
     return f"; {empty} of {len(paths)} images have no keypoints{hidden}"
-
-
-def _page(context: Context) -> StageReport:
-    page = report.page_if_up_to_date(context)
-    if page is None:
-        with context.executor.step("report"):
-            page = report.run(context)
-    return page
 
 
 def _to_filter(context: Context, deadline: Deadline | None) -> tuple[Context, list[StageReport]]:

@@ -1,32 +1,45 @@
 """--within: what a run does without so that it ends in time, and always with an export.
 
-The first pass is made in any case; it is small. Then a pair and its images are tried, and sizes and keypoints are
-halved until what they need fits. Further steps of a cascade, and the measuring of tie points, are taken as long as what
-they need is expected to fit as well. Nothing that has begun is stopped.
+The first pass is made in any case; it is small. Then it is planned how many pixels and keypoints the images have, by
+what is not on file yet and a trial of one pair. Further steps of a cascade, the measuring of tie points and the report
+page are taken as long as what they need is expected to fit as well. Nothing that has begun is stopped.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import time
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 from aeromatch_cli.config import Settings, dump
+from aeromatch_cli.data import Pair
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.files import write_text
-from aeromatch_cli.stages import cascade, check
+from aeromatch_cli.files import read_record, write_text
+from aeromatch_cli.results.record import StageRecord
+from aeromatch_cli.stages import cascade, refine
+from aeromatch_cli.stages.block import with_gsd
 from aeromatch_cli.stages.cascade import StepContext
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.state import BlockState
+from aeromatch_cli.stages.timing import TriedPair, adjusting_s, duration, mean, measuring_s, page_s, tried_pair
 from aeromatch_cli.strategies.refiners import REFINERS
 
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
-_PART = r"(\d+(?:\.\d+)?)\s*(s|m|h|sec|min|hr|second|minute|hour)s?"
-# Sizes and keypoints are halved so often at most, and fall to no less than this.
-_MOST_HALVINGS, _LEAST_KEYPOINTS = 3, 500
-# A block is oriented from images of this size where its settings say no other.
-_LEAST_SIZE_PX = 1600
+_PART = r"(\d+(?:\.\d+)?)\s*(s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?)"
+# Shares of the pixels and keypoints that are planned with one after the other, until what follows fits.
+_SMALLER = (1 / 2, 1 / 4, 1 / 8)
+# What they do not fall below: keypoints of an image, and its longer side where there is no first pass whose images
+# would be larger.
+_LEAST_KEYPOINTS, _LEAST_SIZE_PX = 500, 1600
 # Share of the time that is planned for: a pair and its images do not tell exactly what the others need.
 _PLANNED = 0.9
+# Share of the time that fewer pixels and keypoints, no measuring, or a step left out after its trial must save: what
+# costs little stays.
+_WORTH = 0.05
+# What workers take to load a network.
+_NETWORK_S = 3.0
 
 
 def seconds_of(text: str) -> float:
@@ -42,10 +55,13 @@ def seconds_of(text: str) -> float:
 
 @dataclass
 class Deadline:
-    """When a run is to end. text: as it was given. left_out: what it does without, in words."""
+    """When a run is to end. text: as it was given. left_out: what it does without, in words. short: whether it is
+    expected to end late all the same."""
 
     text: str
+    seconds: float = field(init=False)
     left_out: list[str] = field(default_factory=list)
+    short: bool = False
     started: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
@@ -55,58 +71,169 @@ class Deadline:
     def spent_s(self) -> float:
         return time.monotonic() - self.started
 
-    def holds(self, more_s: float, context: Context, share: float = 1.0) -> bool:
-        """Whether so many seconds, and what follows matching with this share of the keypoints, fit in what is left."""
-        return self.spent_s + more_s + check.later_s(context, share) <= _PLANNED * self.seconds
+    @property
+    def is_kept(self) -> bool:
+        """Whether the run is as it was asked for, and not late."""
+        return not self.left_out and self.spent_s <= self.seconds
+
+    def holds(self, more_s: float) -> bool:
+        """Whether so many seconds more are planned for: the one rule by which all is taken or left out."""
+        return self.spent_s + more_s <= _PLANNED * self.seconds
+
+    def is_worth(self, saved_s: float) -> bool:
+        """Whether it is worth while to do without what takes so many seconds."""
+        return saved_s >= _WORTH * self.seconds
+
+    def plan(self) -> str:
+        """Say what is left out from the start."""
+        aim = f"{self.text} is likely too short; to end as early as it can" if self.short else f"to end in {self.text}"
+        return f"within           {aim}: {'; '.join(self.left_out)}"
 
     def line(self) -> str:
         """Say at the end of the run when it ended, and what it did without."""
         over_s = self.spent_s - self.seconds
-        late = f", {check.duration(over_s)} late" if over_s > 0.0 else ""
+        late = f", {duration(over_s)} late" if over_s >= 0.5 else ""
         done = f"for that: {'; '.join(self.left_out)}" if self.left_out else "nothing was left out"
-        return f"within {self.text}".ljust(16) + f" ended after {check.duration(self.spent_s)}{late}; {done}"
+        return f"within {self.text}".ljust(16) + f" ended after {duration(self.spent_s)}{late}; {done}"
+
+
+@dataclass(frozen=True)
+class _Todo:
+    """What of a step, or of a block without steps, is to be made. Verdicts alone count as nothing: they take a tenth of
+    what matching does, or less."""
+
+    images: frozenset[str]
+    pairs: tuple[Pair, ...]
+    jobs: int
+
+    @classmethod
+    def of(cls, context: Context, image_ids: Collection[str]) -> _Todo:
+        state, anew = BlockState.of(context), context.scope.overwrite
+        images = frozenset(image_ids) - (set() if anew else state.with_features(image_ids))
+        pairs = list[Pair]()
+        for image_id0, row in context.rows().items():
+            made_of = {} if anew else {i: known.fingerprint for i, known in context.store.matches(image_id0).items()}
+            pairs += [p for p in row if p.image_id1 not in made_of or made_of[p.image_id1] != state.wanted_matches(p)]
+        return cls(images, tuple(pairs), context.executor.jobs)
+
+    def seconds(self, image_s: float, pair_s: float) -> float:
+        return (len(self.images) * image_s + len(self.pairs) * pair_s) / self.jobs
+
+    def sample(self, pairs: Collection[Pair]) -> Pair:
+        """The pair that is tried: of those with most images to be made the middle one, whose cost is likely to be that
+        of others."""
+        lacking = [len(self.images & set(pair.ids)) for pair in pairs]
+        most = max(lacking)
+        best = [pair for pair, count in zip(pairs, lacking, strict=True) if count == most]
+        return best[len(best) // 2]
+
+
+@dataclass(frozen=True, eq=False)
+class _Option:
+    """Settings with a share of the pixels and keypoints. first: the context of the block, or of its first step, with
+    them. pixels: share of the pixels that is left. keypoints: of an image at most. left_out: in words."""
+
+    settings: Settings
+    first: Context
+    todo: _Todo
+    pixels: float
+    keypoints: float
+    left_out: tuple[str, ...]
+
+    @classmethod
+    def of(cls, context: Context, share: float) -> _Option:
+        settings, update, left_out = context.settings, {}, []
+        longest_px = max(max(image.width_px, image.height_px) for image in context.block.images)
+        before_px = min(longest_px, settings.block.max_size_px or longest_px)
+        least_px = _LEAST_SIZE_PX if settings.first_pass is None else settings.first_pass.size_px
+        size_px = max(min(least_px, before_px), round(before_px * share**0.5))
+        if size_px < before_px:
+            update["block"] = settings.block.model_copy(update={"max_size_px": size_px})
+            left_out.append(f"images are reduced to {size_px} pixels (from {before_px})")
+        name = next((name for name in ("keypoints", "points") if hasattr(settings.extract, name)), "")
+        asked = getattr(settings.extract, name, 0)
+        count = max(min(_LEAST_KEYPOINTS, asked), round(asked * share))
+        if count < asked:
+            update["extract"] = settings.extract.model_copy(update={name: count})
+            left_out.append(f"{count} {name} per image instead of {asked}")
+        settings = settings.model_copy(update=update)
+        block = context.block
+        if "block" in update:
+            block = with_gsd(block, (block.gsd_m, block.reduced_gsd_m), size_px)
+        first = _first(replace(context, settings=settings, block=block) if update else context)
+        todo = _Todo.of(first, [image.image_id for image in block.images])
+        keypoints = float(count) if name else math.inf
+        return cls(settings, first, todo, (size_px / before_px) ** 2, keypoints, tuple(left_out))
+
+    def seconds(self, tried: TriedPair) -> float:
+        """What is to be made of the images and pairs, and what follows. tried: with the settings as asked for. Features
+        take as long as their pictures are large, and pairs as keypoints are many, squared."""
+        keypoints = min(tried.keypoints, self.keypoints)
+        pair_s = tried.pair_s * (keypoints / max(tried.keypoints, 1.0)) ** 2
+        return self.todo.seconds(tried.image_s * self.pixels, pair_s) + _later_s(self.first, keypoints)
 
 
 def fitting(context: Context, deadline: Deadline) -> Settings | None:
-    """Return settings with smaller images and fewer keypoints with which a block can be matched in time; None where
-    they need not change, or cannot. What they leave out is noted."""
-    in_time = deadline.holds(0.0, context)
-    tried = check.tried_pair(context, context.pairs[len(context.pairs) // 2]) if in_time else None
-    if in_time and tried is None:  # its images cannot be read
+    """Return settings with smaller images and fewer keypoints with which a block can be matched in time, or as early as
+    it can; None where they stay as they are. What they leave out is noted.
+
+    What is on file counts as done: where the features are there, nothing is reduced, as all would be made anew.
+    """
+    asked = chosen = _Option.of(context, 1.0)
+    if not asked.todo.images:
         return None
-    jobs, share = context.executor.jobs, 1.0
+    started = len(asked.todo.images) < len(context.block.images)
+    if not started and not deadline.holds(_least_s(context) + _later_s(context, _LEAST_KEYPOINTS)):
+        chosen, deadline.short = _Option.of(context, _SMALLER[-1]), True  # and no time is spent on a trial
+    else:
+        tried = tried_pair(asked.first, asked.todo.sample(context.pairs), keep=True)
+        if tried is None:  # its images cannot be read; the stages say so
+            return None
+        left = _Todo.of(asked.first, asked.todo.images)  # without what the trial has made
+        asked = chosen = replace(asked, todo=left)
+        for share in _SMALLER:
+            if deadline.holds(chosen.seconds(tried)):
+                break
+            option = _Option.of(context, share)
+            if deadline.is_worth(chosen.seconds(tried) - option.seconds(tried)):
+                chosen = option
+        deadline.short = not deadline.holds(chosen.seconds(tried))
+    deadline.left_out += chosen.left_out
+    return chosen.settings if chosen.left_out else None
 
-    def needed_s() -> float:
-        if tried is None:
-            return 0.0
-        images_s, pairs_s = len(context.block.images) * tried.image_s, len(context.pairs) * tried.pair_s
-        return (images_s * share + pairs_s * share**2) / jobs
 
-    for _ in range(_MOST_HALVINGS):
-        if deadline.holds(needed_s(), context, share):
-            break
-        share /= 2
-    return None if share == 1.0 else _reduced(context, share, deadline)
+def _first(context: Context) -> Context:
+    """The context of the first step of a cascade, or that of the block where there is none."""
+    if not context.settings.cascade:
+        return context
+    settings = context.settings.model_copy(update={"cascade": ()})
+    return cascade.steps_on_file(replace(context, settings=settings))[0].context
 
 
-def _reduced(context: Context, share: float, deadline: Deadline) -> Settings | None:
-    """The settings with so many of the pixels and of the keypoints, or of the points of a grid; None where they have no
-    less to give."""
-    settings, update = context.settings, {}
-    longest_px = max(max(image.width_px, image.height_px) for image in context.block.images)
-    before_px = min(longest_px, settings.block.max_size_px or longest_px)
-    least_px = _LEAST_SIZE_PX if settings.first_pass is None else settings.first_pass.size_px
-    size_px = max(min(least_px, before_px), round(before_px * share**0.5))
-    if size_px < before_px:
-        update["block"] = settings.block.model_copy(update={"max_size_px": size_px})
-        deadline.left_out.append(f"images are reduced to {size_px} pixels (from {before_px})")
-    name = next((name for name in ("keypoints", "points") if hasattr(settings.extract, name)), "")
-    asked = getattr(settings.extract, name, 0)
-    if asked > _LEAST_KEYPOINTS:
-        count = max(_LEAST_KEYPOINTS, round(asked * share))
-        update["extract"] = settings.extract.model_copy(update={name: count})
-        deadline.left_out.append(f"{count} {name} per image instead of {asked}")
-    return settings.model_copy(update=update) if update else None
+def _least_s(context: Context) -> float:
+    """Seconds that the images take at least: those of the first pass, where they are no larger; nothing is known of a
+    network, which a GPU may make faster."""
+    record = read_record(context.workspace.first_pass.stage_report("extract"), StageRecord)
+    if record is None or not record.done or context.settings.extract.network:
+        return 0.0
+    return len(context.block.images) * record.seconds / record.done
+
+
+def _later_s(context: Context, keypoints: float) -> float:
+    """Seconds of what always follows matching. The page does not count: it goes first."""
+    return measuring_s(context, keypoints) + adjusting_s(context, keypoints)
+
+
+def _keypoints(context: Context) -> float:
+    """Keypoints of an image on file, on average."""
+    found = (context.store.features(image.image_id) for image in context.block.images)
+    return mean([known.keypoints for known in found if known is not None])
+
+
+def keep_asked(context: Context) -> None:
+    """Keep the settings as they were asked for, for `aeromatch run WORK`: before anything else has reduced ones."""
+    if not context.workspace.asked.is_file():
+        write_text(context.workspace.asked, dump(context.settings))
 
 
 def steps_in_time(context: Context, deadline: Deadline) -> list[StepContext]:
@@ -117,11 +244,11 @@ def steps_in_time(context: Context, deadline: Deadline) -> list[StepContext]:
         part = replace(context, settings=context.settings.model_copy(update={"cascade": every[:count]}))
         if count:
             step = cascade.steps_on_file(part)[-1]
-            in_time = deadline.holds(0.0, context)
-            if step.reasons and not (in_time and deadline.holds(_step_s(step), context)):
-                asked, *others = every[count - 1 :]
-                deadline.left_out.append(f"without the step {asked.name}, for {_pairs(len(step.reasons))}")
-                deadline.left_out += [f"without the step {other.name}" for other in others]
+            if not _fits(step, done[0], deadline):
+                deadline.left_out.append(
+                    f"without the step {step.name}, which {_pairs(len(step.reasons))} would have taken"
+                )
+                deadline.left_out += [f"without the step {other.name}" for other in every[count:]]
                 break
         reports = [step.reports for step in done]
         steps = cascade.run(part)
@@ -129,34 +256,48 @@ def steps_in_time(context: Context, deadline: Deadline) -> list[StepContext]:
     return done
 
 
-def _step_s(step: StepContext) -> float:
-    """Seconds that a step takes, by a trial of one of its pairs."""
-    context = step.context
-    tried = check.tried_pair(context, next(pair for pair in context.pairs if pair.ids in step.reasons))
-    if tried is None:
-        return 0.0
-    return (step.own_features * len(step.images) * tried.image_s + len(step.reasons) * tried.pair_s) / (
-        context.executor.jobs
-    )
+def _fits(step: StepContext, first: StepContext, deadline: Deadline) -> bool:
+    """Whether there is time for a step. It is tried on a pair, whose features stay on file, only if there would be time
+    where its images and pairs took no longer than those of the first step, which is cheaper, did in this run."""
+    context, later_s = step.context, _later_s(first.context, _keypoints(first.context))
+    images = step.images if step.own_features else ()
+    todo = _Todo.of(context, images)
+    if not todo.images and not todo.pairs:
+        return True
+    image_s, pair_s = (report.seconds * todo.jobs / max(report.done, 1) for report in first.reports[:2])
+    start_s = _NETWORK_S * bool(todo.images and context.settings.extract.network)
+    if not deadline.holds(start_s + todo.seconds(image_s, pair_s) + later_s):
+        return False
+    pairs = [pair for row in context.rows().values() for pair in row]
+    tried = tried_pair(context, todo.sample(todo.pairs or pairs), keep=True)
+    if tried is None:  # its images cannot be read; the stages say so
+        return True
+    rest_s = _Todo.of(context, images).seconds(tried.image_s, tried.pair_s)
+    return deadline.holds(rest_s + later_s) or not deadline.is_worth(rest_s)
 
 
 def _pairs(count: int) -> str:
     return f"{count} pair{'s' if count != 1 else ''}"
 
 
-def page_in_time(context: Context, deadline: Deadline) -> bool:
-    """Whether there is time for the page of a report that is asked for."""
-    if context.settings.run.report and deadline.spent_s > deadline.seconds:
-        deadline.left_out.append("without the report page (`aeromatch report` makes it)")
-        return False
-    return context.settings.run.report
-
-
 def measured_in_time(context: Context, deadline: Deadline) -> Context:
-    """Return the context without the measuring of tie points, where that is not expected to fit."""
-    if context.settings.least_squares is None or deadline.holds(0.0, context):
+    """Return the context without the measuring of tie points, where that is not expected to fit and takes more than a
+    little."""
+    keypoints = _keypoints(context)
+    if deadline.holds(_later_s(context, keypoints)) or not deadline.is_worth(measuring_s(context, keypoints)):
+        return context
+    if refine.is_current(context):
         return context
     deadline.left_out.append("without the least-squares measuring of tie points (refine)")
+    keep_asked(context)
     settings = context.settings.model_copy(update={"refine": REFINERS["none"]()})
     write_text(context.workspace.config, dump(settings))
     return replace(context, settings=settings)
+
+
+def page_in_time(context: Context, deadline: Deadline) -> bool:
+    """Whether there is time for the page of a report; that it is left out is noted."""
+    if deadline.holds(page_s(context)):
+        return True
+    deadline.left_out.append("without the report page (`aeromatch report` makes it)")
+    return False
