@@ -52,14 +52,14 @@ class Model:
     def kind(self) -> PlacementKind:
         return self.figures.kind
 
-    def with_tied(self, found: Mapping[str, Pose]) -> Model:
-        """Return the model with images that a pair each ties to it."""
+    def with_images(self, found: Mapping[str, Pose]) -> Model:
+        """Return the model with further images. found: image_id -> pose with an attitude."""
         rotations, centers_m = dict(self.rotations), dict(self.centers_m)
         for image_id, pose in found.items():
             assert pose.world_rotation is not None
             rotations[image_id], centers_m[image_id] = pose.world_rotation, pose.center_m
         figures = self.figures.model_copy(update={"images": len(rotations)})
-        return replace(self, rotations=rotations, centers_m=centers_m, figures=figures, tied=frozenset(found))
+        return replace(self, rotations=rotations, centers_m=centers_m, figures=figures)
 
 
 @dataclass(frozen=True, eq=False)

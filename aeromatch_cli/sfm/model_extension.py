@@ -41,7 +41,7 @@ def grown(
         found = _resected(model, free, lenses, thresholds_px)
         if found:
             own = sorted({camera_ids[i] for i in found} & known.keys())
-            larger = _with(model, found, {k: known[k] for k in own})
+            larger = replace(model.with_images(found), cameras={**model.cameras, **{k: known[k] for k in own}})
             sound = sound_part(larger, free, lenses, thresholds_px, given)
             model = sound if sound is not None and sound.rotations.keys() > model.rotations.keys() else model
         done.append(model)
@@ -54,15 +54,3 @@ def _resected(
     known = {i: Pose(model.centers_m[i], rotation, 0.0, 0.0) for i, rotation in model.rotations.items()}
     limits_px = {i: SLACK * limit for i, limit in thresholds_px.items()}
     return resected(pairs, known, lenses, limits_px, (0.0, 0.0))
-
-
-def _with(model: Model, found: Mapping[str, Pose], cameras: Mapping[str, Camera]) -> Model:
-    """The model with the poses found. cameras: of their images, where a model has found them."""
-    rotations, centers_m = dict(model.rotations), dict(model.centers_m)
-    for image_id, pose in found.items():
-        assert pose.world_rotation is not None
-        rotations[image_id], centers_m[image_id] = pose.world_rotation, pose.center_m
-    figures = model.figures.model_copy(update={"images": len(rotations)})
-    return replace(
-        model, rotations=rotations, centers_m=centers_m, cameras={**model.cameras, **cameras}, figures=figures
-    )

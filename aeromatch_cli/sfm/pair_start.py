@@ -8,6 +8,7 @@ it: every 6th image of seneca, with positions and with nothing (5 images; pycolm
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -105,4 +106,4 @@ def _extended(
         tied = tied_by_pairs(pairs, known, given, cameras, thresholds_px)
     else:
         tied = tied_by_ground(pairs, known, cameras, thresholds_px)
-    return model.with_tied({i: pose for i, (pose, _) in tied.items()})
+    return replace(model.with_images({i: pose for i, (pose, _) in tied.items()}), tied=frozenset(tied))
