@@ -55,7 +55,7 @@ _OURS = {"flight": "all", "method": "`aeromatch`"}
 RESULTS: Sequence[Result] = (
     Result(
         "Rendered blocks of two seeds, poses off by 3 degrees and 5 % of the flying height: one sun, two suns, two "
-        "exposures, five cameras, grass, desert, rows, facades",
+        "exposures, five cameras, poor texture, rows and facades",
         "`auto` has {baseline} x the correct matches of `baseline`, {pycolmap} x those of pycolmap (guided); {share} "
         "of what it keeps is correct, of pycolmap's {theirs}; worst block {worst}",
         {

@@ -41,7 +41,7 @@ from benchmarks.tables import Row, write_rows
 
 METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
 # The conditions under which a strategy may help; both sections share the runs of `auto`.
-STRATEGY_PLACES = "city:mixed,suburb:two-flights,city:exposed,city:oblique,grass:nadir"
+STRATEGY_PLACES = "city:mixed,city:exposed,city:oblique,grass:nadir,farmland:nadir"
 STRATEGIES = "filter=epipolar+graph,filter=clustered-ransac+epipolar,match=lightglue,enhance=shadow,simulate=neighbours"
 
 
@@ -62,7 +62,7 @@ def _rendered(section: str, arguments: Sequence[str]) -> None:
     add("--jobs", type=options.positive, default=2, help="methods at a time, on one core each")
     add("--reference-weights", type=Path, metavar="DIR", help="weights of peers that are networks")
     options.add_output(parser)
-    quick = {"places": "suburb:nadir,suburb:exposed", "seeds": "1", "size": "320x240", "images": 4, "keypoints": 1000}
+    quick = {"places": "suburb:nadir,city:exposed", "seeds": "1", "size": "320x240", "images": 4, "keypoints": 1000}
     args = options.parse(parser, arguments, quick)
     if unknown := sorted(set(args.places) - set(PLACES)):
         parser.error(f"--places: {', '.join(unknown)} are none of {', '.join(PLACES)}")
