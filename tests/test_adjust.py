@@ -284,6 +284,38 @@ def test_groups_share_their_cameras(truth: Truth) -> None:
 
 
 @pytest.mark.slow
+def test_groups_of_different_cameras_are_both_adjusted(truth: Truth) -> None:
+    """Two places, each with cameras of its own: what the first has found of its lenses is nothing to the second."""
+    far = {i: f"far{i[-1]}" for i in IMAGE_IDS}
+    others = {"a": "c", "b": "d"}
+    contents, block = disturbed(truth, 0), truth.block
+    images = [
+        replace(one, image_id=far[one.image_id], name=f"far/{one.name}", camera_id=others[one.camera_id])
+        for one in block.images
+    ]
+    both = replace(
+        block,
+        images=(*block.images, *images),
+        cameras={**block.cameras, **{other: block.cameras[k] for k, other in others.items()}},
+        poses={**contents.block.poses, **{far[i]: pose for i, pose in contents.block.poses.items()}},
+    )
+    keypoints = {i: contents.keypoints_px(i) for i in IMAGE_IDS}
+    keypoints |= {far[i]: keypoints[i] for i in IMAGE_IDS}
+    more = [
+        replace(p, pair=replace(p.pair, image_id0=far[p.pair.image_id0], image_id1=far[p.pair.image_id1]))
+        for p in truth.pairs
+    ]
+    given = given_positions(truth, 1, 0.1)
+    groups = [Group("positions", IMAGE_IDS), Group("level", tuple(far.values()))]
+    observed = Observed(given, dict.fromkeys("abcd", 0.02), {})
+    adjusted, figures = adjust_block(
+        ExportContents(both, keypoints.__getitem__, (*truth.pairs, *more)), observed, groups, fixed=False
+    )
+    assert [one.images for one in figures] == [6, 6]
+    assert adjusted.cameras.keys() == set("abcd")
+
+
+@pytest.mark.slow
 def test_a_further_group_keeps_its_points_where_the_first_has_found_another_lens(truth: Truth) -> None:
     """Strips there and back, oriented with a principal point 20 px off, and attitudes that make up for it: beside the
     lens that the first group finds they are 40 px off each other."""

@@ -322,13 +322,13 @@ def test_what_was_asked_for_outlasts_an_interruption(site: Site, monkeypatch: py
     assert not (work / "asked.yaml").exists()
 
 
-def _slow_step(monkeypatch: pytest.MonkeyPatch, steps: Sequence[float]) -> list[Context]:
-    """Trials of the step `guided` that say so many seconds for every pair, one after the other."""
+def _slow_step(monkeypatch: pytest.MonkeyPatch, steps: Sequence[float], name: str = "guided") -> list[Context]:
+    """Trials of a step that say so many seconds for every pair, one after the other."""
     real, tried, seconds = timing.tried_pair, list[Context](), iter(steps)
 
     def slow(context: Context, pair: object, *, keep: bool) -> TriedPair | None:
         found = real(context, pair, keep=keep)  # type: ignore[arg-type]
-        if "guided" not in context.scope.part or found is None:
+        if name not in context.scope.part or found is None:
             return found
         tried.append(context)
         return TriedPair(found.image_s, next(seconds), found.keypoints, found.verified)
@@ -354,6 +354,20 @@ def test_a_step_that_does_not_fit_is_left_out_alone(site: Site, monkeypatch: pyt
     assert site("run", *STEP).facts["stages"]["match"]["result"]["settled_by"].keys() == {"first", "guided"}
     outcome = site("run", "--within", "1h", "--set", "refine.max_shift_px=2.5", *STEP)
     assert (outcome.facts["left_out"], len(tried)) == ([], 1)
+
+
+@pytest.mark.slow
+def test_what_a_trial_of_a_step_has_found_is_no_part_of_the_block(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The features of the pair that was tried stay on file; later commands find the block as it was left."""
+    tried = _slow_step(monkeypatch, [3600.0], "learned")
+    step = ("--set", "cascade=learned", "--set", "cascade.learned.below_matches=100000")
+    outcome = site("run", "--within", "1h", *step)
+    assert [words.split(",")[0] for words in outcome.facts["left_out"]] == ["without the step learned"]
+    assert len(tried) == 1
+    assert len(list((site.work / "features" / "learned").glob("*.npz"))) == 2
+    for command in ("filter", "adjust", "export"):
+        again = invoke(command, "--workspace", site.work, "--json")
+        assert (again.code, again.done()) == (0, {}), command
 
 
 @pytest.mark.slow

@@ -250,7 +250,8 @@ Within = Annotated[
         "--within",
         metavar="DURATION",
         rich_help_panel=_WORK,
-        help="End in this time (20m, 1h, 90s): smaller images, fewer keypoints and steps, where all would take longer.",
+        help="End in this time (20m, 1h, 90s). Where all would take longer, the report page is left out, then steps, "
+        "the measuring of tie points, and pixels and keypoints are fewer.",
     ),
 ]
 Overwrite = Annotated[

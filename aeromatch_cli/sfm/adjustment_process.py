@@ -89,7 +89,6 @@ def refine(folder: Path) -> None:
     while waiting:
         group = waiting.popleft()
         free = not task["fixed"]
-        observed = given if group["kind"] != "level" else given.without_positions()
         model = _posed(work, folder, set(group["images"]))
         model = _triangulated(pycolmap, model, folder, rough=free)
         if free and group["kind"] != "given":
@@ -98,7 +97,11 @@ def refine(folder: Path) -> None:
                 continue
             keep_images(model, parts[0])
             waiting.extend(_groups_of(group, parts[1:]))
-        attitudes = _attitudes(model, given) if group["kind"] == "given" else ()
+        kind = group["kind"]
+        if kind == "positions" and not given.places(image_numbers(model)):
+            kind = "level"
+        observed = given if kind != "level" else given.without_positions()
+        attitudes = _attitudes(model, given) if kind == "given" else ()
         registered: list[int] = []
         outcome: Outcome | None = None
         control: ControlInGroup | None = None
@@ -108,10 +111,10 @@ def refine(folder: Path) -> None:
                 grouped |= set(registered)
                 model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
             # Poses fit the lens that they were found with: only points from both tell what fits another one.
-            for number in held:
+            for number in sorted(held & images_by_camera(model).keys()):
                 set_lens(pycolmap, model.cameras[number], work.lenses[number], number in work.fisheyes)
-            inside = surveyed if group["kind"] != "level" else []
-            model, outcome, control = _refined(work, folder, model, group["kind"], observed, attitudes, held, inside)
+            inside = surveyed if kind != "level" else []
+            model, outcome, control = _refined(work, folder, model, kind, observed, attitudes, held, inside)
         _clean(work, model, observed)
         if not image_numbers(model):
             continue
@@ -119,9 +122,7 @@ def refine(folder: Path) -> None:
         held |= lenses.keys()
         name = f"model{len(models)}.npz"
         _write_model(folder / name, model, lenses, given, outcome)
-        result = GroupResult(
-            kind=group["kind"], registered=[*map(names.image, registered)], control=control, **figures(model)
-        )
+        result = GroupResult(kind=kind, registered=[*map(names.image, registered)], control=control, **figures(model))
         if outcome is not None:
             result = adjusted_group(result, outcome, observed, names)
         models.append({"file": name, "result": result.as_json()})

@@ -38,7 +38,8 @@ class Model:
     """Images that were oriented together, in the world frame.
 
     rotations: image_id -> (3, 3) cam_from_world; centers_m: image_id -> (3,). cameras: camera_id -> Camera as
-    calibrated. points_m: (P, 3). figures: counts, and how it was placed. tied: images that hang on a single pair each.
+    calibrated. points_m: (P, 3). figures: counts, and how it was placed. tied: images that hang on a single pair each
+    -> standard deviations of their places, in the units of centers_m, and attitudes, degrees.
     """
 
     rotations: Mapping[str, FloatArray]
@@ -46,7 +47,7 @@ class Model:
     cameras: Mapping[str, Camera]
     points_m: FloatArray
     figures: MappedModel
-    tied: frozenset[str] = frozenset()
+    tied: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def kind(self) -> PlacementKind:

@@ -87,6 +87,10 @@ class Given:
         """(N,) over the axes."""
         return np.asarray(np.sqrt((self.sigmas_m**2).mean(axis=1)))
 
+    def places(self, numbers: Collection[int]) -> bool:
+        """Whether images have positions enough to place a group in the world: one tells neither scale nor north."""
+        return int(np.isfinite(self.positions_m[np.array(sorted(numbers)) - 1]).all(axis=1).sum()) >= 2
+
     def without_positions(self) -> Given:
         """Return what was given for a group in a frame of its own, where given positions are no observations."""
         unknown = np.full_like(self.positions_m, np.nan)

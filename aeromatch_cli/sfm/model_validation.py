@@ -70,6 +70,19 @@ def sound_part(
     return only(model, groups[0])
 
 
+def contradicted_images(
+    poses: Mapping[str, Pose],
+    pairs: Sequence[PairPoints],
+    cameras: Mapping[str, Camera],
+    thresholds_px: Mapping[str, float],
+) -> set[str]:
+    """Return the images most of whose matches with the others their poses do not explain. cameras and thresholds_px: by
+    image_id."""
+    limits_px = {image_id: SLACK * limit for image_id, limit in thresholds_px.items()}
+    inside = [p for p in pairs if {p.image_id0, p.image_id1} <= poses.keys() and len(p.indices) >= MIN_MATCHES]
+    return _contradicted(inside, [explained_share(p, poses, cameras, limits_px) for p in inside])
+
+
 def only(model: Model, image_ids: Collection[str]) -> Model:
     """Return some images of a model."""
     left = sorted(image_ids)

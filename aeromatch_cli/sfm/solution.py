@@ -11,7 +11,6 @@ from aeromatch_cli.data import Block, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.components import connected_groups
-from aeromatch_cli.results.adjustment import PlacementKind
 from aeromatch_cli.results.stages import FocalChange, OrientResult
 from aeromatch_cli.sfm.conventions import Recognised, recognised
 from aeromatch_cli.sfm.dem import Terrain, ground_points, terrains_of
@@ -144,7 +143,10 @@ def unoriented_remark(evidence: FirstPassMatches) -> str:
     if not evidence.pairs:
         return f"{said}: no two of them have enough matches"
     if len(evidence.matched) < FEWEST_IMAGES:
-        return f"{said}: at least {FEWEST_IMAGES} images must show the same ground, {len(evidence.matched)} do"
+        return (
+            f"{said}: at least {FEWEST_IMAGES} images must have verified matches with others, "
+            f"{len(evidence.matched)} have some"
+        )
     moved_px = [np.median(np.linalg.norm(p.points0_px - p.points1_px, axis=1)) for p in evidence.pairs]
     if float(np.median(moved_px)) < _STANDING_PX:
         return f"{said}: they show the same from the same place"
@@ -219,8 +221,8 @@ def from_models(
         stays=False,
         frame="own" if own or not block.poses else "world",
         models=[model.figures for model in models],
-        by_one_pair=sorted(tied.keys() | _tied_inside(models, "positions")),
-        by_ground=sorted(on_ground.keys() | _tied_inside(models, "level")),
+        by_one_pair=sorted(tied),
+        by_ground=sorted(on_ground.keys() | {i for model in models for i in model.tied}),
         calibrated=sorted({k for model in models for k in model.cameras}),
         points=points,
         focal_lengths=_focal_lengths(evidence.stated_cameras, cameras),
@@ -241,16 +243,13 @@ def _of_models(block: Block, models: Sequence[Model], before: Before) -> tuple[d
         height_m = float(np.median([c[2] for c in model.centers_m.values()]) - np.median(model.points_m[:, 2]))
         sigma_m = _SIGMA_POSITION_SHARE * abs(height_m)
         for image_id, rotation in model.rotations.items():
-            found[image_id] = Pose(model.centers_m[image_id], rotation, sigma_m, _SIGMA_ANGLE_DEG)
+            sigmas = model.tied.get(image_id, (sigma_m, _SIGMA_ANGLE_DEG))
+            found[image_id] = Pose(model.centers_m[image_id], rotation, *sigmas)
         found |= kept
         cameras |= model.cameras
         if kept:
             cameras |= {k: old for k, old in before.cameras.items() if _same_lens(model.cameras.get(k), old)}
     return cameras, found
-
-
-def _tied_inside(models: Sequence[Model], kind: PlacementKind) -> set[str]:
-    return {image_id for model in models if model.kind == kind for image_id in model.tied}
 
 
 def _tied_by_ground(

@@ -88,8 +88,21 @@ def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
 
 
 def _usable(steps: Sequence[StepContext]) -> list[tuple[StepContext, set[str]]]:
-    """Steps with features of their own, and the images that have them."""
-    return [(step, BlockState.of(step.context).with_features(step.images)) for step in steps if step.own_features]
+    """Steps with features of their own, and the images that have them. A step that --within has tried on one pair and
+    left out has matched none: its features count as if they were not there."""
+    found = []
+    for step in steps:
+        if step.own_features:
+            matched = step.images if step.name == cascade.FIRST else _matched_images(step)
+            found.append((step, BlockState.of(step.context).with_features(matched)))
+    return found
+
+
+def _matched_images(step: StepContext) -> set[str]:
+    """Images of the step with a pair that it has matched."""
+    store = step.context.store
+    matched = {(i, other) for i in {image_id0 for image_id0, _ in step.reasons} for other in store.matches(i)}
+    return {image_id for key in step.reasons.keys() & matched for image_id in key}
 
 
 def _matched(steps: Sequence[StepContext], pair: Pair) -> list[StepContext]:

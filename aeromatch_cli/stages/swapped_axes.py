@@ -26,7 +26,8 @@ def exchanged_columns(block: Block, model: Model) -> str:
     sigmas_m = np.array([block.poses[i].sigma_position_m for i in ids])
     for words, positions_m in _readings(block, given_m):
         placement = place(centers, model.points_m, positions_m, sigmas_m)
-        if placement.kind == "positions" and not placement.contradiction:
+        # Some of few positions fit any reading by chance.
+        if placement.kind == "positions" and not placement.contradiction and placement.trusted:
             return words
     return ""
 

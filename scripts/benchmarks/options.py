@@ -84,7 +84,7 @@ def section_of(
     name: str, about: str | None, sections: Sequence[str], arguments: Sequence[str]
 ) -> tuple[str, list[str]]:
     """The first of the arguments, one of the sections of a benchmark, and the others."""
-    parser = make_parser(name, about)
+    parser = make_parser(name, f"{about}\nOptions: scripts/bench {name} SECTION --help")
     parser.add_argument("section", choices=sections)
     return parser.parse_args(arguments[:1]).section, list(arguments[1:])
 

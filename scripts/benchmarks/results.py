@@ -1,8 +1,9 @@
 """Makes the tables of docs/results: runs the standing benchmarks one after the other, each in processes of its own.
 
-All of them take two hours on two idle cores. Every benchmark goes on where it was, as long as the code is the same: OUT
-has a folder for each state of aeromatch_cli. A benchmark that fails does not keep the others from being run. With
---docs the tables are written into their pages, and their figures into the README.
+They are planned for two hours on two idle cores that multiply bfloat16; others take up to twice as long. Every
+benchmark goes on where it was, as long as the code is the same: OUT has a folder for each state of aeromatch_cli. A
+benchmark that fails does not keep the others from being run. With --docs the tables are written into their pages, and
+their figures into the README.
 """
 
 from __future__ import annotations

@@ -9,14 +9,14 @@ matching with verification, and its global mapping. Its spatial matching takes 5
 images this is exhaustive matching.
 
 Wall: seconds of the command, start-up and report included. Processor: seconds of all processes together, which other
-work on the machine hardly changes; ratios are theirs. Peak: the largest sum of what all processes hold (PSS). Shares
+work on the machine hardly changes; ratios are theirs. Peak: the largest sum of the memory of all processes. Shares
 are those of wall seconds: pycolmap's matching includes verification, its adjustment is the mapping; the rest is start,
 pairs, consistency, export and report.
 
 Every run is made --repeats times; figures are medians, ranges in brackets lie between the least and the most.
 
 --before CHECKOUT runs another checkout of this project beside, for instance one that `git worktree add CHECKOUT COMMIT`
-makes: chains @COMMIT.
+makes; its rows are named PRESET@COMMIT.
 
 Writes OUT/speed.json and OUT/speed.md. Rows that OUT has are not made again.
 """

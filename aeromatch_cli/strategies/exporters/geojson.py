@@ -1,7 +1,8 @@
 """GeoJSON for maps (QGIS and others): camera positions, footprints, and pairs with their matches.
 
-RFC 7946: longitude and latitude, WGS84, rings counter-clockwise. A local block has none: its files hold metres of the
-block's own frame and say so in the member `crs` of GeoJSON 2008, by which GDAL and QGIS take them for what they are.
+RFC 7946: longitude and latitude, WGS84, rings counter-clockwise. A local block has none: its files hold metres, or
+units of an arbitrary scale, of its own frame and say so in the member `crs` of GeoJSON 2008, by which GDAL and QGIS
+take them for what they are.
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ from aeromatch_cli.strategies.exporters.links import Links, camera_fields, footp
 from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
 from aeromatch_cli.strategies.exporters.styles import qml
 
-_LOCAL_FRAME = 'LOCAL_CS["local frame of the block",UNIT["metre",1]]'
+_LOCAL_FRAMES = {
+    True: 'LOCAL_CS["local frame of the block",UNIT["metre",1]]',
+    False: 'LOCAL_CS["frame of the block, of arbitrary scale",UNIT["unknown",1]]',
+}
 
 
 class GeoJson(Strategy):
     """Writes cameras.geojson (angles, standard deviations and residuals of every image, times, counts of verified
     matches), footprints.geojson and pairs.geojson, and beside each its style for QGIS."""
 
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
     name: Literal["geojson"] = "geojson"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -54,7 +58,7 @@ class GeoJson(Strategy):
             ]
             head: dict[str, Any] = {"type": "FeatureCollection"}
             if contents.geographic is None:
-                head["crs"] = {"type": "name", "properties": {"name": _LOCAL_FRAME}}
+                head["crs"] = {"type": "name", "properties": {"name": _LOCAL_FRAMES[contents.block.metric]}}
             for name, features in (("cameras", cameras), ("footprints", areas), ("pairs", links)):
                 write(partial / f"{name}.geojson", json.dumps({**head, "features": features}))
                 write(partial / f"{name}.qml", qml(name))
