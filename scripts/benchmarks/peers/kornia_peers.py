@@ -1,4 +1,4 @@
-"""Peers `aliked`, `keynet` and `keynet-tfeat`, and their networks, through kornia."""
+"""Peers `keynet` and `keynet-tfeat`, and their networks, through kornia."""
 
 from __future__ import annotations
 
@@ -6,42 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.errors import ConfigError
-from benchmarks.peers.base import Described, Options, Scene, read_colour, read_gray, read_weights, size_of, strongest
+from benchmarks.peers.base import Described, Options, Scene, read_gray, read_weights, strongest
 from benchmarks.peers.matching import Peer
-
-ALIKED_ROTATED, ALIKED = "aliked-n16rot", "aliked-n16"
-_DERIVED = {"dkd.hw_grid"}  # a derived buffer that kornia does not keep
-
-
-class Aliked(Peer):
-    """ALIKED through kornia, by default n16rot, the rotation-trained weights.
-
-    Colour images; the B strongest maxima of its score map, whatever its threshold. No ratio: its users match by mutual
-    neighbours. Source: Zhao et al., IEEE TIM 2023.
-    """
-
-    ratio = None
-
-    def __init__(self, scene: Scene, options: Options, *, model: str = ALIKED_ROTATED) -> None:
-        from kornia.feature import ALIKED
-
-        super().__init__(scene, options)
-        most = options.keypoints
-        self.network: Any = ALIKED(model, max_num_keypoints=most, detection_threshold=0.0).eval()
-        missing, unexpected = self.network.load_state_dict(read_weights(options, f"{model}.pth"), strict=False)
-        if unexpected or set(missing) - _DERIVED:
-            raise ConfigError(f"{model}.pth does not fit kornia's ALIKED: missing {missing}, unexpected {unexpected}")
-
-    def features(self, image: str) -> Described:
-        import torch
-
-        pixels = read_colour(self.scene, image)
-        with torch.inference_mode():
-            one = self.network(pixels)[0]
-        sides = (one.keypoints.numpy(), one.keypoint_scores.numpy(), one.descriptors.numpy())
-        return strongest(*sides, self.options.keypoints, size_px=size_of(pixels))
-
 
 TFEAT, HARD_TFEAT = "tfeat-liberty.params", "HardTFeat.pth"
 # HardTFeat's own names -> those of kornia's TFeat: the same layers, the last a convolution over the whole patch.

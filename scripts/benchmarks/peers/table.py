@@ -10,10 +10,11 @@ from pathlib import Path
 
 from aeromatch_cli.config import Settings, load, parse_method, preset_names
 from aeromatch_cli.errors import ConfigError
+from benchmarks.peers.aliked import ALIKED, ALIKED_ROTATED, Aliked
 from benchmarks.peers.base import Method, Options, Scene, weights_path
 from benchmarks.peers.colmap import Colmap
 from benchmarks.peers.ground import OnGround
-from benchmarks.peers.kornia_peers import ALIKED, ALIKED_ROTATED, HARD_TFEAT, TFEAT, Aliked, KeyNet
+from benchmarks.peers.kornia_peers import HARD_TFEAT, TFEAT, KeyNet
 from benchmarks.peers.opencv import OpenCvAsift, OpenCvSift
 from benchmarks.peers.ours import Preset
 from benchmarks.peers.published import LIGHTERGLUE, Disk, WithLightGlue, XFeat
