@@ -54,9 +54,7 @@ def sound_part(
     matches in stored pixels. given: image_id -> pose whose position was given.
     """
     poses = {i: Pose(model.centers_m[i], rotation, 0.0, 0.0) for i, rotation in model.rotations.items()}
-    limits_px = {image_id: SLACK * limit for image_id, limit in thresholds_px.items()}
-    inside = [p for p in pairs if {p.image_id0, p.image_id1} <= poses.keys() and len(p.indices) >= MIN_MATCHES]
-    shares = [explained_share(p, poses, cameras, limits_px) for p in inside]
+    inside, shares = _explained(poses, pairs, cameras, thresholds_px)
     wrong = _contradicted(inside, shares)
     explained = [p for p, share in zip(inside, shares, strict=True) if share >= EXPLAINED_SHARE]
     good = [p for p in explained if not wrong & {p.image_id0, p.image_id1}]
@@ -78,9 +76,19 @@ def contradicted_images(
 ) -> set[str]:
     """Return the images most of whose matches with the others their poses do not explain. cameras and thresholds_px: by
     image_id."""
+    return _contradicted(*_explained(poses, pairs, cameras, thresholds_px))
+
+
+def _explained(
+    poses: Mapping[str, Pose],
+    pairs: Sequence[PairPoints],
+    cameras: Mapping[str, Camera],
+    thresholds_px: Mapping[str, float],
+) -> tuple[list[PairPoints], list[float]]:
+    """The pairs between posed images, and the share of the matches of each that the poses explain."""
     limits_px = {image_id: SLACK * limit for image_id, limit in thresholds_px.items()}
     inside = [p for p in pairs if {p.image_id0, p.image_id1} <= poses.keys() and len(p.indices) >= MIN_MATCHES]
-    return _contradicted(inside, [explained_share(p, poses, cameras, limits_px) for p in inside])
+    return inside, [explained_share(p, poses, cameras, limits_px) for p in inside]
 
 
 def only(model: Model, image_ids: Collection[str]) -> Model:

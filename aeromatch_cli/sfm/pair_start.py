@@ -89,9 +89,11 @@ class _Evidence:
     def by_positions(self, start: Mapping[str, Pose]) -> Model | None:
         """The images that their positions tie to a pair, whose own ones place it first and those of all then; None
         where positions are lacking or contradict each other."""
+        if self._positions(start) < len(start):
+            return None
         poses, placement = dict(start), self._placement(start, self.given)
         for _ in range(2):
-            if placement.kind != "positions" or self._positions(start) < len(start):
+            if placement.kind != "positions":
                 return None
             placed = _moved({i: poses[i] for i in start}, placement)
             poses = self._sound(placed, tied_by_pairs(self.pairs, placed, self.given, self.cameras, self.thresholds_px))

@@ -11,6 +11,7 @@ from aeromatch_cli.data import Block, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.components import connected_groups
+from aeromatch_cli.results.adjustment import PlacementKind
 from aeromatch_cli.results.stages import FocalChange, OrientResult
 from aeromatch_cli.sfm.conventions import Recognised, recognised
 from aeromatch_cli.sfm.dem import Terrain, ground_points, terrains_of
@@ -221,8 +222,8 @@ def from_models(
         stays=False,
         frame="own" if own or not block.poses else "world",
         models=[model.figures for model in models],
-        by_one_pair=sorted(tied),
-        by_ground=sorted(on_ground.keys() | {i for model in models for i in model.tied}),
+        by_one_pair=sorted(tied.keys() | _tied_inside(models, "positions")),
+        by_ground=sorted(on_ground.keys() | _tied_inside(models, "level")),
         calibrated=sorted({k for model in models for k in model.cameras}),
         points=points,
         focal_lengths=_focal_lengths(evidence.stated_cameras, cameras),
@@ -250,6 +251,10 @@ def _of_models(block: Block, models: Sequence[Model], before: Before) -> tuple[d
         if kept:
             cameras |= {k: old for k, old in before.cameras.items() if _same_lens(model.cameras.get(k), old)}
     return cameras, found
+
+
+def _tied_inside(models: Sequence[Model], kind: PlacementKind) -> set[str]:
+    return {image_id for model in models if model.kind == kind for image_id in model.tied}
 
 
 def _tied_by_ground(

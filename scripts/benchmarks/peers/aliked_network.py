@@ -36,7 +36,7 @@ _BATCH = 256
 _BATCH_NORM_EPS = 1e-5
 # A keypoint is the largest score of 5 x 5 pixels, moved to their mean weighed by exp(score / temperature).
 _RADIUS_PX, _TEMPERATURE = 2, 0.1
-# Layers that are read by their names, beside those that are folded.
+# Layers of which a file must have the weights.
 _LAYERS = (
     *(f"block{block}.conv{n}" for block in (1, 2) for n in (1, 2)),
     *(f"block{block}.conv{n}.{kind}_conv" for block in (3, 4) for n in (1, 2) for kind in ("offset", "regular")),
@@ -151,8 +151,7 @@ class AlikedNetwork:
         flat = peaks.flatten().nonzero()[:, 0]
         flat = flat[torch.argsort(-scores.flatten()[flat], stable=True)[:most]]
         pixels = torch.stack([flat % width, flat // width], 1)
-        steps = torch.arange(-reach, reach + 1)
-        steps = torch.stack(torch.meshgrid(steps, steps, indexing="ij")[::-1], -1).reshape(-1, 2)
+        steps = _square(-reach, reach + 1)
         around = pixels[:, None] + steps
         near = scores[around[..., 1], around[..., 0]]
         weights = torch.softmax(near / _TEMPERATURE, dim=1)
@@ -169,9 +168,7 @@ class AlikedNetwork:
         weight0, bias0 = self._pair("desc_head.offset_conv.0")
         weight1, bias1 = self._pair("desc_head.offset_conv.2")
         side = weight0.shape[-1]
-        steps = torch.stack(torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")[::-1], -1).reshape(
-            -1, 2
-        )
+        steps = _square(0, side)
         mix, sums = self.tensors["desc_head.sf_conv.weight"][:, :, 0, 0], self.tensors["desc_head.agg_weights"]
         found = []
         for points in points_px.split(_BATCH):
@@ -215,6 +212,12 @@ def _folded(tensors: Mapping[str, Tensor], layer: str, norm: str) -> tuple[Tenso
     return tensors[f"{layer}.weight"] * scale[:, None, None, None], tensors[f"{norm}.bias"] - scale * tensors[
         f"{norm}.running_mean"
     ]
+
+
+def _square(first: int, stop: int) -> Tensor:
+    """(N, 2) x and y of the pixels of a square, row by row."""
+    along = torch.arange(first, stop)
+    return torch.stack(torch.meshgrid(along, along, indexing="ij")[::-1], -1).reshape(-1, 2)
 
 
 def _rows(x: Tensor) -> Tensor:
