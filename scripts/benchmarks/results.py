@@ -33,18 +33,18 @@ class Standing:
 
 
 STANDING: Mapping[str, Standing] = {
-    "auto": Standing("auto.md", 45, ("auto rendered", "auto strategies", "auto real --data DATA")),
-    "claims": Standing("claims.md", 20, ("claims --seed 1 --data DATA --reference-weights WEIGHTS",)),
+    "auto": Standing("auto.md", 58, ("auto rendered", "auto strategies", "auto real --data DATA")),
+    "claims": Standing("claims.md", 12, ("claims --seed 1 --data DATA --reference-weights WEIGHTS",)),
     "peers": Standing(
         "peers.md",
         15,
         ("peers rendered --reference-weights WEIGHTS", "peers real --data DATA --reference-weights WEIGHTS"),
     ),
-    "calibration": Standing("calibration.md", 10, ("calibration",)),
-    "orientation": Standing("orientation.md", 10, ("orientation real --data DATA", "orientation rendered")),
-    "growth": Standing("growth.md", 6, ("growth",)),
-    "speed": Standing("speed.md", 10, ("speed",)),
-    "robustness": Standing("robustness.md", 4, ("robustness",)),
+    "calibration": Standing("calibration.md", 7, ("calibration",)),
+    "orientation": Standing("orientation.md", 12, ("orientation real --data DATA", "orientation rendered")),
+    "growth": Standing("growth.md", 5, ("growth",)),
+    "speed": Standing("speed.md", 8, ("speed --repeats 1",)),
+    "robustness": Standing("robustness.md", 3, ("robustness",)),
 }
 
 

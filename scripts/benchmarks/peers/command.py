@@ -53,7 +53,7 @@ from benchmarks.tables import (
 THREADS = 2
 ENOUGH_CORRECT = 30
 METHODS = (
-    "oblique,fusion,baseline,SIFT=opencv-sift,ASIFT=opencv-asift,pycolmap,pycolmap-guided,keynet,aliked@ground,"
+    "oblique,fusion,baseline,SIFT=opencv-sift,pycolmap,pycolmap-guided,aliked@ground,"
     "aliked+lightglue,aliked+lightglue@ground,disk+lightglue@ground,xfeat+lighterglue@ground"
 )
 _FIGURES = ("possible", "kept", "correct", "median_error_px")
