@@ -6,6 +6,7 @@ import argparse
 import time
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import torch
 from make_lightglue import seeded_tensors, write
 from trainings.lightglue import command as train_lightglue
 from trainings.lightglue import data
-from trainings.lightglue.batches import batch_of, piece
+from trainings.lightglue.batches import batch_of, piece, unit
 from trainings.lightglue.blocks import Pair
 from trainings.lightglue.data import OutOfTime, mapped, read_groups, write_groups
 from trainings.lightglue.homographies import SIZE_PX, make_group
@@ -190,7 +191,8 @@ def test_a_small_network_learns_a_batch_by_heart() -> None:
     first = side(rng.uniform(0, [640, 480], (40, 2)))
     truth = Partners(np.arange(40, dtype=np.int32), np.arange(40, dtype=np.int32))
     batch = batch_of([(first, first, truth), (first.take(np.arange(30)), side(np.zeros((20, 2)), 9),
-                      Partners(np.full(30, NONE, np.int32), np.full(20, NONE, np.int32)))], 40)  # fmt: skip
+                      Partners(np.full(30, NONE, np.int32), np.full(20, NONE, np.int32)))], 40, rng)  # fmt: skip
+    batch = replace(batch, side0=unit(batch.side0), side1=unit(batch.side1))
     network = LightGlue(Dimensions(128, 32, 2, 1, True))
     optimiser = torch.optim.AdamW(network.parameters(), 3e-3)
     losses = []
@@ -252,7 +254,9 @@ def test_a_run_is_not_mixed_with_another(tmp_path: Path, capsys: pytest.CaptureF
     other = write(tmp_path / "other.pth", seeded_tensors(Dimensions(32, 32, 2, 1, add_scale_ori=True)))
     parser = argparse.ArgumentParser()
     plain = {"trained_on": "a", "unseen": "b", "groups": 200, "blocks": 19, "start": None, "scale": 1.0, "batch": 16}
-    args = argparse.Namespace(data=tmp_path / "data", out=tmp_path / "out", only_data=True, rate=1e-3, seed=0, **plain)
+    args = argparse.Namespace(
+        data=tmp_path / "data", out=tmp_path / "out", only_data=True, rate=1e-3, seed=0, features="sift", **plain
+    )
     train_lightglue.check(parser, args)
     args.only_data = False
     train_lightglue.check(parser, args)

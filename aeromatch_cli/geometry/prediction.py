@@ -96,6 +96,11 @@ def search_windows(
     return Windows(0.5 * (low + high), axes, halves)
 
 
+def ground_places(camera: Camera, pose: Pose, points_px: FloatArray, ground_z_m: float) -> FloatArray:
+    """World x, y (N, 2) where rays of stored pixels (N, 2) meet the ground plane; NaN where they do not go down."""
+    return _at_height(pose, _world_rays(camera, pose, points_px), ground_z_m)[:, :2]
+
+
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """World points and where a camera sees them. offsets_m: (N, 3) from its centre. by_world: (N, 2, 3) du/dX."""

@@ -20,6 +20,8 @@ from torch.nn import functional
 _ROWS = 512
 # Rows of an attention matrix that are worked on at once: what belongs to them fits a processor's cache.
 _QUERIES = 256
+# Expected places are off by a hundredth to a fifth of the picture.
+_FASTEST = 30.0
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,7 @@ class Dimensions:
     """What makes a network.
 
     input_dim: length of a descriptor. add_scale_ori: whether keypoints carry scale and orientation (SIFT).
+    knows_ground: whether attention between the pictures knows where keypoints are expected on the ground.
     """
 
     input_dim: int
@@ -34,6 +37,7 @@ class Dimensions:
     n_layers: int
     num_heads: int
     add_scale_ori: bool
+    knows_ground: bool = False
 
 
 @dataclass(frozen=True)
@@ -41,14 +45,17 @@ class Side:
     """One picture's keypoints, B pictures at once.
 
     places: (B, N, 2 or 4) float32, x and y from `normalised`, then scale (half the size in pixels) and orientation in
-    radians where the network wants them. descriptors: (B, N, input_dim) float.
+    radians where the network wants them. descriptors: (B, N, input_dim) float. ground: (B, N, 2) expected places on the
+    ground, of both pictures in one frame, in the units of `places`; None where nothing is expected.
     """
 
     places: Tensor
     descriptors: Tensor
+    ground: Tensor | None = None
 
     def to(self, device: str | torch.device) -> Side:
-        return Side(self.places.to(device), self.descriptors.to(device))
+        ground = None if self.ground is None else self.ground.to(device)
+        return Side(self.places.to(device), self.descriptors.to(device), ground)
 
 
 def normalised(points_px: Tensor, size_px: Tensor) -> Tensor:
@@ -60,22 +67,42 @@ def normalised(points_px: Tensor, size_px: Tensor) -> Tensor:
     return (points_px - half.unsqueeze(-2)) / half.amax(dim=-1)[..., None, None]
 
 
+Rotary = tuple[Tensor, Tensor]  # cosines and sines (B, 1, N, head_dim)
+
+
+@dataclass(frozen=True, eq=False)
+class Code:
+    """Position codes of one side: within its picture, and on the ground (None: nothing is expected)."""
+
+    picture: Rotary
+    ground: Rotary | None
+
+    def at(self, *index: slice | Tensor) -> Code:
+        """Of such pairs, or of such keypoints: an index into (B, 1, N)."""
+        picture, ground = self.picture, self.ground
+        return Code(
+            (picture[0][index], picture[1][index]), None if ground is None else (ground[0][index], ground[1][index])
+        )
+
+
 class FourierEncoding(nn.Module):
     """Rotary position code: every pair of channels is turned by an angle that is linear in the place."""
 
-    def __init__(self, places_dim: int, head_dim: int) -> None:
+    def __init__(self, places_dim: int, head_dim: int, fastest: float = 1.0) -> None:
+        """fastest: how much faster than the slowest channels the fastest ones turn, to begin with."""
         super().__init__()
         self.Wr = nn.Linear(places_dim, head_dim // 2, bias=False)
         nn.init.normal_(self.Wr.weight.data, mean=0.0, std=1.0)
+        self.Wr.weight.data *= torch.logspace(0.0, math.log10(fastest), head_dim // 2)[:, None]
 
-    def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, places: Tensor) -> Rotary:
         """Cosines and sines (B, 1, N, head_dim) of places (B, N, P), in float32: angles of several turns need it."""
         with torch.autocast(places.device.type, enabled=False):
             angles = functional.linear(places.float(), self.Wr.weight.float()).unsqueeze(1)
         return angles.cos().repeat_interleave(2, dim=-1), angles.sin().repeat_interleave(2, dim=-1)
 
 
-def _turned(x: Tensor, code: tuple[Tensor, Tensor]) -> Tensor:
+def _turned(x: Tensor, code: Rotary) -> Tensor:
     """x (B, H, N, head_dim) with its pairs of channels turned."""
     pairs = x.unflatten(-1, (-1, 2))
     crossed = torch.stack((-pairs[..., 1], pairs[..., 0]), dim=-1).flatten(-2)
@@ -113,7 +140,7 @@ class SelfBlock(nn.Module):
         self.out_proj = nn.Linear(dim, dim)
         self.ffn = _mixer(dim)
 
-    def forward(self, x: Tensor, code: tuple[Tensor, Tensor], there: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, code: Rotary, there: Tensor | None = None) -> Tensor:
         """x (B, N, dim) -> the same. there: (B, N) bool, which keypoints are there; None for all."""
         query, key, value = self.Wqkv(x).unflatten(-1, (self.heads, -1, 3)).transpose(1, 2).unbind(-1)
         query, key = _turned(query, code), _turned(key, code)
@@ -134,10 +161,20 @@ class CrossBlock(nn.Module):
         self.ffn = _mixer(dim)
 
     def forward(
-        self, x0: Tensor, x1: Tensor, there0: Tensor | None = None, there1: Tensor | None = None
+        self,
+        x0: Tensor,
+        x1: Tensor,
+        there0: Tensor | None = None,
+        there1: Tensor | None = None,
+        *,
+        ground: tuple[Rotary, Rotary] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """x0 (B, M, dim), x1 (B, N, dim) -> the same. there: (B, M), (B, N) bool; None for all."""
+        """x0 (B, M, dim), x1 (B, N, dim) -> the same. there: (B, M), (B, N) bool; None for all. ground: codes of
+        expected places, used as those within a picture by `SelfBlock`.
+        """
         key0, key1, value0, value1 = (self._by_head(of(x)) for of in (self.to_qk, self.to_v) for x in (x0, x1))
+        if ground is not None:
+            key0, key1 = _turned(key0, ground[0]), _turned(key1, ground[1])
         return self._mixed(x0, key0, key1, value1, there1), self._mixed(x1, key1, key0, value0, there0)
 
     def _by_head(self, x: Tensor) -> Tensor:
@@ -154,6 +191,21 @@ class Layer(nn.Module):
         super().__init__()
         self.self_attn = SelfBlock(dim, heads)
         self.cross_attn = CrossBlock(dim, heads)
+
+    def through(
+        self,
+        x0: Tensor,
+        x1: Tensor,
+        codes: tuple[Code, Code],
+        there0: Tensor | None = None,
+        there1: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """States (B, M, dim), (B, N, dim) after this layer. there: (B, M), (B, N) bool; None for all."""
+        one, other = codes
+        x0, x1 = self.self_attn(x0, one.picture, there0), self.self_attn(x1, other.picture, there1)
+        ground = None if one.ground is None or other.ground is None else (one.ground, other.ground)
+        found: tuple[Tensor, Tensor] = self.cross_attn(x0, x1, there0, there1, ground=ground)
+        return found
 
 
 class Assignment(nn.Module):
@@ -198,6 +250,7 @@ class LightGlue(nn.Module):
         same = dimensions.input_dim == dim
         self.input_proj = nn.Identity() if same else nn.Linear(dimensions.input_dim, dim)
         self.posenc = FourierEncoding(4 if dimensions.add_scale_ori else 2, dim // heads)
+        self.groundenc = FourierEncoding(2, dim // heads, _FASTEST) if dimensions.knows_ground else None
         self.transformers = nn.ModuleList([Layer(dim, heads) for _ in range(count)])
         self.log_assignment = nn.ModuleList([Assignment(dim) for _ in range(count)])
         self.token_confidence = nn.ModuleList([Confidence(dim) for _ in range(count - 1)])
@@ -217,21 +270,26 @@ class LightGlue(nn.Module):
     def with_layers_in(self, kind: torch.dtype) -> LightGlue:
         """This network, everything but the position code in another precision."""
         for name, part in self.named_children():
-            if name != "posenc":
+            if name not in ("posenc", "groundenc"):
                 part.to(dtype=kind)
         return self
 
-    def begin(self, side: Side) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """States (B, N, dim) and position code of one side."""
+    def begin(self, side: Side) -> tuple[Tensor, Code]:
+        """States (B, N, dim) and position codes of one side."""
         kind = self.layers[0].self_attn.Wqkv.weight.dtype
-        cosines, sines = self.posenc(side.places)
-        return self.input_proj(side.descriptors.to(kind)), (cosines.to(kind), sines.to(kind))
+
+        def code(encoding: nn.Module, places: Tensor) -> Rotary:
+            cosines, sines = encoding(places)
+            return cosines.to(kind), sines.to(kind)
+
+        on_ground = None if self.groundenc is None or side.ground is None else code(self.groundenc, side.ground)
+        return self.input_proj(side.descriptors.to(kind)), Code(code(self.posenc, side.places), on_ground)
 
     def states(self, side0: Side, side1: Side) -> Iterator[tuple[Tensor, Tensor]]:
         """States (B, M, dim), (B, N, dim) of both sides after each layer: what training looks at."""
         (x0, code0), (x1, code1) = self.begin(side0), self.begin(side1)
         for layer in self.layers:
-            x0, x1 = layer.cross_attn(layer.self_attn(x0, code0), layer.self_attn(x1, code1))
+            x0, x1 = layer.through(x0, x1, (code0, code1))
             yield x0, x1
 
     def certain(self, index: int, x: Tensor) -> Tensor:
@@ -260,7 +318,7 @@ class LightGlue(nn.Module):
         for index, layer in enumerate(self.layers):
             if min(len(kept[0]), len(kept[1])) == 0:
                 return torch.zeros((0, 2), dtype=torch.int64), torch.zeros(0)
-            x0, x1 = layer.cross_attn(layer.self_attn(x0, code0), layer.self_attn(x1, code1))
+            x0, x1 = layer.through(x0, x1, (code0, code1))
             if index == last:
                 break
             certain = [torch.ones(x.shape[:2], dtype=torch.bool, device=x.device) for x in (x0, x1)]
@@ -280,12 +338,12 @@ class LightGlue(nn.Module):
         return pairs, scores[good]
 
     def _pruned(
-        self, index: int, x: Tensor, code: tuple[Tensor, Tensor], kept: Tensor, certain: Tensor, confidence: float
-    ) -> tuple[Tensor, tuple[Tensor, Tensor], Tensor]:
+        self, index: int, x: Tensor, code: Code, kept: Tensor, certain: Tensor, confidence: float
+    ) -> tuple[Tensor, Code, Tensor]:
         stays = torch.nonzero(self.staying(index, x, certain, confidence)[0]).squeeze(1)
         if len(stays) == x.shape[1]:
             return x, code, kept
-        return x[:, stays], (code[0][:, :, stays], code[1][:, :, stays]), kept[stays]
+        return x[:, stays], code.at(slice(None), slice(None), stays), kept[stays]
 
 
 def log_assignment(head: Assignment, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor, Tensor]:

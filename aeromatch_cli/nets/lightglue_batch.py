@@ -8,22 +8,22 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from aeromatch_cli.nets.lightglue import Layer, LightGlue, Side, mutual_best
+from aeromatch_cli.nets.lightglue import Code, Layer, LightGlue, Side, mutual_best
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """One side of B pairs, filled up to N keypoints. x: (B, N, dim). code: twice (B, 1, N, head_dim).
+    """One side of B pairs, filled up to N keypoints. x: (B, N, dim).
 
     there: (B, N) bool, the keypoints that are left.
     """
 
     x: Tensor
-    code: tuple[Tensor, Tensor]
+    code: Code
     there: Tensor
 
     def of(self, pairs: Tensor) -> _State:
-        return _State(self.x[pairs], (self.code[0][pairs], self.code[1][pairs]), self.there[pairs])
+        return _State(self.x[pairs], self.code.at(pairs), self.there[pairs])
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,7 @@ class _Batch:
     def through(self, layer: Layer) -> _Batch:
         """After one more layer."""
         one, other = self.state0, self.state1
-        x0, x1 = layer.self_attn(one.x, one.code, one.there), layer.self_attn(other.x, other.code, other.there)
-        x0, x1 = layer.cross_attn(x0, x1, one.there, other.there)
+        x0, x1 = layer.through(one.x, other.x, (one.code, other.code), one.there, other.there)
         return replace(self, state0=replace(one, x=x0), state1=replace(other, x=x1))
 
 
@@ -128,7 +127,10 @@ def _filled_up(network: LightGlue, sides: Sequence[Side]) -> _State:
         """(1, N, C) each to (B, longest, C), zeros after the last."""
         return torch.cat([torch.nn.functional.pad(part, (0, 0, 0, longest - part.shape[1])) for part in parts])
 
-    whole = Side(joined([side.places for side in sides]), joined([side.descriptors for side in sides]))
+    # What is expected of one pair is so of all.
+    expected = [side.ground for side in sides if side.ground is not None]
+    ground = joined(expected) if len(expected) == len(sides) else None
+    whole = Side(joined([side.places for side in sides]), joined([side.descriptors for side in sides]), ground)
     device = whole.places.device
     there = torch.arange(longest, device=device) < torch.tensor(counts, device=device)[:, None]
     return _State(*network.begin(whole), there)

@@ -21,7 +21,7 @@ from aeromatch_cli.nets.loading import check_same_tensors
 _DERIVED = frozenset({"confidence_thresholds"})
 _OLD_LAYER_KEY = re.compile(r"^(self|cross)_attn\.(\d+)\.")
 _LAYER_KEY = re.compile(r"^transformers\.(\d+)\.")
-_POSITION_KEY = "posenc.Wr.weight"
+_POSITION_KEY, _GROUND_KEY = "posenc.Wr.weight", "groundenc.Wr.weight"
 _WIDTH_KEY = "transformers.0.self_attn.out_proj.weight"
 _PROJECTION_KEY = "input_proj.weight"
 # Entry of a safetensors file's metadata: slope and offset, separated by a space.
@@ -112,6 +112,7 @@ def infer_dimensions(tensors: dict[str, Tensor]) -> Dimensions:
         n_layers=len(layers),
         num_heads=num_heads,
         add_scale_ori=position_dim == 4,
+        knows_ground=_GROUND_KEY in tensors,
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
+from aeromatch_cli.strategies.matchers.lightglue.learned import LearnedLightGlue
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.strategies.matchers.polar import Polar
 
@@ -14,5 +15,6 @@ MATCHERS: Mapping[str, type[Strategy]] = {
     "nearest": Nearest,
     "bidirectional": Bidirectional,
     "lightglue": LightGlue,
+    "lightglue-learned": LearnedLightGlue,
     "polar": Polar,
 }

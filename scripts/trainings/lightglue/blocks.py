@@ -23,7 +23,11 @@ from aeromatch_cli.stages import extract, pairs
 from aeromatch_cli.stages.context import Context
 from trainings.lightglue.sides import Partners, Seen, partners, seen
 
-RECIPES = ((), ("simulate=none", "extract.orientation=gradient"))
+# By the features: ground views and stored pictures.
+RECIPES = {
+    "sift": ((), ("simulate=none", "extract.orientation=gradient")),
+    "learned": (("extract=learned",), ("extract=learned", "simulate=none")),
+}
 KEYPOINTS = 1500
 LEAST_PARTNERS = 16
 
@@ -38,18 +42,21 @@ class Pair:
     two_suns: bool
 
 
-def block_pairs(folder: Path, keypoints: int = KEYPOINTS, recipes: tuple[tuple[str, ...], ...] = RECIPES) -> list[Pair]:
+def block_pairs(folder: Path, keypoints: int = KEYPOINTS, features: str = "sift") -> list[Pair]:
     """Every pair of a rendered block with partners enough, of each recipe."""
     truth, suns = load_truth(folder), _suns(folder)
     found = []
-    for recipe in recipes:
-        sides = {name: side for name, side, _ in extracted(folder, recipe, keypoints)}
+    for recipe in RECIPES[features]:
+        signed = features == "learned"
+        sides = {name: side for name, side, _ in extracted(folder, recipe, keypoints, signed=signed)}
         for name0, name1, mates in partnered(truth, sides, LEAST_PARTNERS):
             found.append(Pair(sides[name0], sides[name1], mates, suns[name0] != suns[name1]))
     return found
 
 
-def extracted(folder: Path, recipe: tuple[str, ...], keypoints: int) -> Iterator[tuple[str, Seen, extract.ExtractTask]]:
+def extracted(
+    folder: Path, recipe: tuple[str, ...], keypoints: int, *, signed: bool = False
+) -> Iterator[tuple[str, Seen, extract.ExtractTask]]:
     """Every picture of a rendered block that has keypoints: its name, what is seen in it, and what made that."""
     with tempfile.TemporaryDirectory() as scratch:
         # The recipe comes first: `extract=` resets what was set of it.
@@ -59,7 +66,7 @@ def extracted(folder: Path, recipe: tuple[str, ...], keypoints: int) -> Iterator
             extract.run_task(task)
             features = read_features(task.path)
             if len(features.descriptors):
-                yield image.name, seen(features), task
+                yield image.name, seen(features, signed=signed), task
 
 
 def partnered(truth: Truth, sides: Mapping[str, Seen], least: int) -> Iterator[tuple[str, str, Partners]]:

@@ -35,7 +35,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, load_lightglue
 from trainings.blocks import LEFT_OUT
-from trainings.lightglue.batches import Batch, batch_of, piece
+from trainings.lightglue.batches import Batch, batch_of, piece, unit
 from trainings.lightglue.blocks import LEAST_PARTNERS, Pair
 from trainings.lightglue.data import SHARD, OutOfTime, pictures, prepare, read_block, read_groups
 from trainings.lightglue.loss import loss_of
@@ -53,11 +53,13 @@ from trainings.runs import (
     training_device,
 )
 
-DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True)
+DIMENSIONS = Dimensions(
+    input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True, knows_ground=True
+)
 DECAY, CLIP = 0.999, 1.0
 ALL_KEYPOINTS = 4096
 # Arguments of which another value makes other data, and another run.
-OF_DATA, OF_RUN = ("trained_on", "unseen", "groups", "blocks", "seed"), ("start", "scale", "batch", "rate")
+OF_DATA, OF_RUN = ("features", "trained_on", "unseen", "groups", "blocks", "seed"), ("start", "scale", "batch", "rate")
 REPORT_EVERY, SAVE_EVERY = 16_000, 2_000  # pairs
 
 
@@ -93,7 +95,7 @@ def drawn(stage1: list[Pair], stage2: list[Pair], phase: Phase, size: int, seen:
         # Upright descriptors do not turn with the picture.
         sides = (pair.side0, pair.side1, pair.truth)
         pieces.append(piece(*sides, phase.count, rng, free=not upright))
-    return batch_of(pieces, phase.count)
+    return batch_of(pieces, phase.count, rng)
 
 
 class Batches(Dataset[Batch]):
@@ -125,7 +127,8 @@ class Batches(Dataset[Batch]):
 
 
 def on(batch: Batch, device: str) -> Batch:
-    return Batch(*(part.to(device) for part in (batch.side0, batch.side1, batch.partners0, batch.partners1)))
+    sides = (unit(side.to(device)) for side in (batch.side0, batch.side1))
+    return Batch(*sides, batch.partners0.to(device), batch.partners1.to(device))
 
 
 @dataclass
@@ -226,7 +229,9 @@ def validation_sets(data: Path, keypoints: tuple[int, int] = (512, 1024)) -> dic
     second = read_all(data / "unseen2", read_block)
     turned = [pair for pair in first if pair.side0.angles_rad.any()]
     upright = [pair for pair in first if not pair.side0.angles_rad.any()]
-    return {
+    third = read_all(data / "unseen3", read_block)
+    sets = {} if not third else {"photographs": thinned(third, keypoints[1], 60)}
+    return sets | {
         "homography, turned": thinned(turned, keypoints[0], 40),
         "homography, upright": thinned(upright, keypoints[0], 40),
         "rendered, one sun": thinned([pair for pair in second if not pair.two_suns], keypoints[1], 40),
@@ -325,6 +330,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--data", type=Path, required=True, help="folder of real blocks, each with a folder images")
     add("--trained-on", default="sheffield,caliterra,brighton", help="real blocks whose pictures are warped")
     add("--unseen", default="ochota,lewis,seneca", help="real blocks for validation only")
+    add("--features", choices=("sift", "learned"), default="sift", help="whose keypoints and descriptors are matched")
     add("--groups", type=at_least_one, default=2400, help="groups of four homography views")
     add("--blocks", type=int, default=60, help="rendered blocks, at least 19")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")

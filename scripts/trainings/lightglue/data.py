@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 
 from trainings.blocks import LEFT_OUT, render
-from trainings.lightglue.blocks import Pair, block_pairs
+from trainings.lightglue.blocks import RECIPES, Pair, block_pairs
 from trainings.lightglue.homographies import make_group
+from trainings.lightglue.photographs import photograph_pairs
 from trainings.lightglue.sides import Partners, Seen
 
 SHARD = 50  # groups of homography views in a file
@@ -36,7 +37,7 @@ def prepare(
     trained_on, unseen: real blocks below `data` whose pictures are warped for training and for validation; every
     fourth shard is of rendered pictures. until: of time.time(), when no further file is begun. Raises OutOfTime then.
     """
-    for folder in ("stage1", "stage2", "unseen1", "unseen2"):
+    for folder in ("stage1", "stage2", "unseen1", "unseen2", "unseen3"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     blocks = range(args.blocks)
     folders = mapped(partial(render, args.rendered), list(blocks), args.jobs, until)
@@ -48,12 +49,23 @@ def prepare(
     for shard in range(args.groups // SHARD):
         paths = made if shard % 4 == 3 else real
         first = args.seed * 10**7 + shard * SHARD
-        jobs.append(partial(write_groups, out / "stage1" / f"{shard:04d}.npz", paths, first, SHARD))
+        jobs.append(partial(write_groups, out / "stage1" / f"{shard:04d}.npz", paths, first, SHARD, args.features))
     for index, paths in enumerate((other, left_out)):
-        jobs.append(partial(write_groups, out / "unseen1" / f"{index}.npz", paths, 10**6 + index * SHARD, SHARD))
+        first = 10**6 + index * SHARD
+        jobs.append(partial(write_groups, out / "unseen1" / f"{index}.npz", paths, first, SHARD, args.features))
     for name, group in (("stage2", known), ("unseen2", left)):
         paths = ((out / name / f"{folder.name}.npz", folder) for folder in group)
-        jobs += [partial(write_block, path, partial(block_pairs, folder)) for path, folder in paths]
+        jobs += [
+            partial(write_block, path, partial(block_pairs, folder, features=args.features)) for path, folder in paths
+        ]
+    if args.features == "learned":
+        recipe = RECIPES["learned"][0]
+        for kind, names in (("stage2", trained_on), ("unseen3", unseen)):
+            jobs += [
+                partial(write_block, out / kind / f"{name}.npz", partial(photograph_pairs, data / name, recipe))
+                for name in names
+            ]
+        jobs.reverse()  # whole blocks of photographs take longest
     mapped(_call, jobs, args.jobs, until)
 
 
@@ -86,13 +98,13 @@ def pictures(folders: Iterable[Path]) -> list[Path]:
     return [path for path in found if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".tif", ".tiff")]
 
 
-def write_groups(path: Path, chosen: list[Path], first: int, count: int) -> None:
+def write_groups(path: Path, chosen: list[Path], first: int, count: int, features: str = "sift") -> None:
     """Groups of views of chosen pictures in a file, numbered from `first`, unless it is there."""
     if path.is_file():
         return
     arrays: dict[str, Any] = {}
     for number in range(count):
-        group = make_group(chosen, first + number)
+        group = make_group(chosen, first + number, features)
         for view, side in enumerate(group.views):
             arrays |= {f"{number}.{view}.{name}": value for name, value in side.arrays().items()}
         for a, b in combinations(range(len(group.views)), 2):

@@ -16,6 +16,7 @@ import numpy as np
 from aeromatch_cli.data import Camera, View
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.extractors.sift import Sift
 from trainings.lightglue.sides import Array, Partners, Seen, partners, seen
 
@@ -47,12 +48,19 @@ def _moved(matrix: Array, points_px: Array) -> Array:
     return there
 
 
-def make_group(paths: list[Path], seed: int) -> Group:
+def extractor_of(features: str, *, free: bool) -> Sift | Learned:
+    """features: "sift" or "learned". free: views are turned at will."""
+    if features == "sift":
+        return Sift(keypoints=KEYPOINTS, orientation="gradient" if free else "upright")
+    return Learned(keypoints=KEYPOINTS, orientation="network" if free else "upright")
+
+
+def make_group(paths: list[Path], seed: int, features: str = "sift") -> Group:
     """Group number `seed`; the same for the same list of pictures."""
     rng = np.random.default_rng([seed, 5])
     base = base_of(read_pixels(paths[int(rng.integers(len(paths)))], colour=False), rng)
     free = rng.random() < 0.5
-    extractor = Sift(keypoints=KEYPOINTS, orientation="gradient" if free else "upright")
+    extractor = extractor_of(features, free=free)
     views, matrices = [], []
     for _ in range(VIEWS):
         matrix = random_homography(base.shape[::-1], free, rng)
@@ -61,7 +69,7 @@ def make_group(paths: list[Path], seed: int) -> Group:
         gray = developed(gray, rng)
         view = View("source", *SIZE_PX, np.eye(3), True, 0.0)
         camera = Camera("PINHOLE", *SIZE_PX, (500.0, 500.0, SIZE_PX[0] / 2, SIZE_PX[1] / 2))
-        views.append(seen(extractor(camera, [ViewPixels(view, gray, seen_px)])))
+        views.append(seen(extractor(camera, [ViewPixels(view, gray, seen_px)]), signed=features == "learned"))
         matrices.append(matrix)
     return Group(tuple(views), np.stack(matrices))
 

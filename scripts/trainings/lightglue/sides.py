@@ -21,8 +21,9 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """One view. points_px: (N, 2) from the view's corner; sizes_px, angles_rad: (N,); descriptors: (N, 128) uint8;
-    size_px: (2,) width, height; places_px: (N, 2) of the same keypoints where truth speaks of them."""
+    """One view. points_px: (N, 2) from the view's corner; sizes_px, angles_rad: (N,); descriptors: (N, 128) uint8,
+    int8 of learned ones, whose values have a sign; size_px: (2,) width, height; places_px: (N, 2) of the same
+    keypoints where truth speaks of them."""
 
     points_px: Array
     sizes_px: Array
@@ -39,14 +40,15 @@ class Seen:
         return vars(self)
 
 
-def seen(features: Features, view: int = 0) -> Seen:
-    """A view of extracted features; places are source pixels."""
+def seen(features: Features, view: int = 0, *, signed: bool = False) -> Seen:
+    """A view of extracted features; places are source pixels. signed: of learned ones (`extractors.context`)."""
     rows = np.flatnonzero(features.view_idx == view)
+    descriptors = features.descriptors[rows]
     return Seen(
         points_px=(features.view_keypoints_px[rows] + np.float32(COLMAP_OFFSET_PX)).astype(np.float32),
         sizes_px=features.view_size_px[rows].astype(np.float32),
         angles_rad=wrapped_rad(features.view_orientation_deg[rows]),
-        descriptors=features.descriptors[rows],
+        descriptors=(descriptors.astype(np.int16) - 128).astype(np.int8) if signed else descriptors,
         size_px=features.view_sizes_px[view].astype(np.float32),
         places_px=features.keypoints_px[features.descriptor_keypoint_idx[rows]].astype(np.float32),
     )

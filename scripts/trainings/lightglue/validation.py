@@ -12,12 +12,13 @@ import numpy as np
 from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.nets.lightglue_file import Calibration
 from aeromatch_cli.strategies.matchers.descriptors.scan import mutual_nearest
-from trainings.lightglue.batches import as_side
+from trainings.lightglue.batches import as_side, expected, unit
 from trainings.lightglue.blocks import Pair
 from trainings.lightglue.sides import NONE, UNKNOWN, Array
 
 RATIO, LEAST_SCORE = 0.8, 0.01
 LIKE_OCTAVES, LIKE_DEG = 0.5, 30.0
+SIGMA = 0.03  # of expected places, half a picture is 1
 EDGES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
@@ -109,15 +110,22 @@ def by_ratio(pair: Pair) -> tuple[Array, Array]:
     """The mutual ratio test: matches (M, 2) and 1 - d1/d2."""
     side0, side1 = pair.side0, pair.side1
     rows, columns, ratios = mutual_nearest(
-        side0.descriptors, side1.descriptors, np.arange(len(side1.points_px)), ratio=RATIO
+        side0.descriptors.astype(np.float32),
+        side1.descriptors.astype(np.float32),
+        np.arange(len(side1.points_px)),
+        ratio=RATIO,
     )
     return np.stack([rows, columns], axis=1), 1.0 - ratios
 
 
-def by_network(network: LightGlue, pair: Pair) -> tuple[Array, Array]:
-    """Matches (M, 2) and scores, all layers, nothing pruned."""
+def by_network(network: LightGlue, pair: Pair, sigma: float | None = None) -> tuple[Array, Array]:
+    """Matches (M, 2) and scores, all layers, nothing pruned. sigma: of places that are expected, None: of none."""
     device = next(network.parameters()).device
-    sides = [as_side([side]).to(device) for side in (pair.side0, pair.side1)]
+    grounds = [None, None]
+    if sigma is not None:
+        grounds = [[one] for one in expected(pair.side0, pair.side1, pair.truth, sigma, np.random.default_rng(0))]
+    both = zip((pair.side0, pair.side1), grounds, strict=True)
+    sides = [unit(as_side([side], ground).to(device)) for side, ground in both]
     indices, scores = network.match(*sides, threshold=LEAST_SCORE, depth_confidence=-1.0, width_confidence=-1.0)
     return indices.cpu().numpy(), scores.cpu().numpy()
 
@@ -194,6 +202,9 @@ def report(network: LightGlue, sets: dict[str, list[Pair]]) -> dict[str, dict[st
             "ratio_precision": ratio.precision,
             "ratio_recall": ratio.recall,
             "recall": own.recall_at(ratio.precision),
+            "recall_with_poses": judged((pair, *by_network(network, pair, SIGMA)) for pair in pairs).recall_at(
+                ratio.precision
+            ),
             "recall_at_0.1": _above(own, 0.1).recall,
             "precision_at_0.1": _above(own, 0.1).precision,
             "ratio_wrong": int((~ratio.right).sum()),

@@ -7,7 +7,7 @@ in radians in (-pi, pi], RootSIFT of unit length.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray
+from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, PairGeometry
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.geometry.prediction import ground_places
 from aeromatch_cli.nets.precision import Device, Precision, device_of, layer_type
+from aeromatch_cli.strategies.extractors.context import from_bytes
 
 # Around the keypoints that are left of a view; training takes it from here.
 FRAME_PX = 4.0
@@ -31,6 +33,7 @@ class NetworkInput:
     """The keypoints of one view that are compared.
 
     rows: (N,) of the image's descriptors. points_px: (N, 2) from the corner; size_px: (2,) width, height.
+    ground: (N, 2) expected places on the ground, as `nets.lightglue.Side` has them; None where nothing is expected.
     """
 
     rows: IntArray
@@ -39,10 +42,12 @@ class NetworkInput:
     orientations_rad: FloatArray
     descriptors: FloatArray
     size_px: FloatArray
+    ground: FloatArray | None = None
 
 
-def network_input(features: Features, view: int, kept: BoolArray, most: int) -> NetworkInput:
-    """Of one view, such keypoints as are `kept` (K,), the strongest `most` of them.
+def network_input(features: Features, view: int, kept: BoolArray, most: int, *, signed: bool = False) -> NetworkInput:
+    """Of one view, such keypoints as are `kept` (K,), the strongest `most` of them. signed: the descriptors are bytes of
+    values with a sign, as of learned features.
 
     What is left of a view has a frame of its own, as in training.
     """
@@ -65,7 +70,7 @@ def network_input(features: Features, view: int, kept: BoolArray, most: int) -> 
         points_px=points,
         scales_px=features.view_size_px[rows].astype(np.float32) / 2.0,
         orientations_rad=wrapped_rad(features.view_orientation_deg[rows]),
-        descriptors=_as_float(features.descriptors[rows]),
+        descriptors=_of_unit_length(from_bytes(features.descriptors[rows]) if signed else features.descriptors[rows]),
         size_px=size_px,
     )
 
@@ -113,7 +118,8 @@ class LoadedNetwork:
             more = np.stack([shown.scales_px, shown.orientations_rad], axis=1)
             places = torch.cat([places, torch.from_numpy(more)], dim=1)
         descriptors = torch.from_numpy(np.ascontiguousarray(shown.descriptors))
-        return Side(places[None].to(self.device), descriptors[None].to(self.device))
+        ground = None if shown.ground is None else torch.from_numpy(shown.ground)[None]
+        return Side(places[None], descriptors[None], ground).to(self.device)
 
 
 @dataclass(frozen=True)
@@ -163,9 +169,36 @@ def wrapped_rad(angles_deg: FloatArray) -> FloatArray:
     return np.deg2rad(180.0 - np.mod(180.0 - degrees, 360.0)).astype(np.float32)
 
 
-def _as_float(descriptors: NDArray[Any]) -> FloatArray:
-    """float32 descriptors; stored RootSIFT (uint8, x 512) regains unit length."""
-    if descriptors.dtype != np.uint8:
-        return descriptors.astype(np.float32)
+def _of_unit_length(descriptors: NDArray[Any]) -> FloatArray:
+    """float32; what is stored as bytes regains unit length."""
     values = descriptors.astype(np.float32)
-    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1.0)
+    return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6))
+
+
+def with_expected_places(
+    side0: NetworkInput, side1: NetworkInput, features: tuple[Features, Features], geometry: PairGeometry
+) -> tuple[NetworkInput, NetworkInput]:
+    """Two views with the places where the poses expect their keypoints on the ground plane: east and south of the first
+    one's middle, half of its longer side is 1. Without both attitudes and the ground, or above the horizon, nothing is
+    expected.
+    """
+    pose0, pose1, ground_z_m = geometry.pose0, geometry.pose1, geometry.ground_z_m
+    if pose0 is None or pose1 is None or ground_z_m is None:
+        return side0, side1
+    if pose0.world_rotation is None or pose1.world_rotation is None:
+        return side0, side1
+    points0_px, points1_px = (
+        one.keypoints_px[one.descriptor_keypoint_idx[side.rows]]
+        for one, side in zip(features, (side0, side1), strict=True)
+    )
+    places_m = [
+        ground_places(geometry.camera0, pose0, points0_px, ground_z_m),
+        ground_places(geometry.camera1, pose1, points1_px, ground_z_m),
+    ]
+    if not all(len(places) and np.isfinite(places).all() for places in places_m):
+        return side0, side1
+    middle, half = (places_m[0].max(axis=0) + places_m[0].min(axis=0)) / 2.0, np.ptp(places_m[0], axis=0).max() / 2.0
+    if half <= 0.0:
+        return side0, side1
+    grounds = [((places - middle) * [1.0, -1.0] / half).astype(np.float32) for places in places_m]
+    return replace(side0, ground=grounds[0]), replace(side1, ground=grounds[1])

@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
-from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.precision import DEVICE, Device, Precision, check_device, device_of
 from aeromatch_cli.strategies.matchers.descriptors.assignment import one_to_one
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined, ratio_test
@@ -37,16 +36,16 @@ _DOUBTFUL = 0.7
 _SURER = (0.3, 0.5, 0.8)
 
 
-class LightGlue(Search):
+class Attention(Search):
     """LightGlue (Lindenberger et al., ICCV 2023) for pairs in which the ratio test finds few matches.
 
-    Without `weights`, those that ship with the package, trained on aerial images (nets/trained/lightglue.md).
+    Without `weights`, those that ship with the package, trained on aerial images (nets/trained/*.md).
+    shipped: their file.
     """
 
-    version: ClassVar[int] = 6
     network: ClassVar[bool] = True
-    reads_descriptors: ClassVar[str] = "RootSIFT"
-    name: Literal["lightglue"] = "lightglue"
+    shipped: ClassVar[str]
+    name: str
     network_below_matches: int = Field(
         250,
         ge=1,
@@ -103,17 +102,12 @@ class LightGlue(Search):
 
     def fingerprint_files(self) -> tuple[str, ...]:
         """Path of the file whose SHA-256 belongs to the fingerprint. Raises ConfigError where it is missing."""
-        from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
+        from aeromatch_cli.nets.files import shipped_path
         from aeromatch_cli.nets.folder import resolve_weights
 
         if self.weights is not None:
             return (str(resolve_weights(self.weights)),)
-        if not SHIPPED_LIGHTGLUE.is_file():
-            raise ConfigError(
-                "matcher lightglue needs a weights file: set `match.weights` to its path, or add it with "
-                "`aeromatch weights add PATH` and set `match.weights` to its name"
-            )
-        return (str(SHIPPED_LIGHTGLUE),)
+        return (str(shipped_path(self.shipped)),)
 
     def check_files(self, descriptor_length: int) -> None:
         """Loads the user's own weights once. Those of the package are checked by `aeromatch weights verify`."""
@@ -161,10 +155,7 @@ class LightGlue(Search):
                 np.ones(len(comparison.features1.keypoints_px), bool),
             )
         views = [
-            (
-                network_input(comparison.features0, int(view0), shown[0], self.max_keypoints),
-                network_input(comparison.features1, int(view1), shown[1], self.max_keypoints),
-            )
+            self.inputs(comparison, int(view0), int(view1), shown)
             for view0, view1 in np.argwhere(comparison.comparable)
         ]
         views = [(side0, side1) for side0, side1 in views if len(side0.rows) and len(side1.rows)]
@@ -179,6 +170,14 @@ class LightGlue(Search):
         )
         return found.take(one_to_one(*comparison.keypoints(found), found.costs))
 
+    def inputs(
+        self, comparison: Comparison, view0: int, view1: int, shown: tuple[BoolArray, BoolArray]
+    ) -> tuple[NetworkInput, NetworkInput]:
+        """What the network is given of two views. shown: (K0,), (K1,) the keypoints that the other image may show."""
+        sides = (comparison.features0, view0, shown[0]), (comparison.features1, view1, shown[1])
+        side0, side1 = (network_input(*side, self.max_keypoints) for side in sides)
+        return side0, side1
+
     @property
     def batches_pairs(self) -> bool:
         """A GPU takes many pairs in the time of one."""
@@ -191,3 +190,12 @@ class LightGlue(Search):
             path, self.precision, self.device, self.threshold, self.depth_confidence, self.width_confidence
         )
         return loaded_network(wanted).run_network(inputs)
+
+
+class LightGlue(Attention):
+    """Of SIFT's keypoints."""
+
+    version: ClassVar[int] = 6
+    reads_descriptors: ClassVar[str] = "RootSIFT"
+    shipped: ClassVar[str] = "lightglue"
+    name: Literal["lightglue"] = "lightglue"
