@@ -137,7 +137,7 @@ def test_lightglues_training_goes_on_where_it_was(
     monkeypatch.setattr(train_lightglue, "phases", lambda *_, **__: plan)
     weights = []
     for minutes, calls in ((0.0, 1), (1e-9, 4)):
-        args = options(tmp_path / str(minutes), scale=1.0, start=None)
+        args = options(tmp_path / str(minutes), scale=1.0, start=None, features="sift")
         args.minutes, args.batch = minutes, 1  # one of 256 keypoints: eight and four of these
         (args.out / "data" / "stage2").mkdir(parents=True)
         write_block(args.out / "data" / "stage2" / "block.npz", lambda: [shifted_pair()])

@@ -1,4 +1,5 @@
-"""Train the LightGlue that ships with the package: SIFT keypoints of aerial images, 6 layers of 128 channels.
+"""Train the LightGlue networks that ship with the package: keypoints of aerial images, SIFT's or (--features learned)
+learned ones; 6 layers of 128 channels.
 
 Stage 1 learns from homography pairs: pictures of --trained-on (real blocks below --data) and of rendered blocks, warped
 and developed anew (trainings.lightglue.homographies). Stage 2 mixes them with pairs of the rendered blocks themselves
@@ -6,12 +7,17 @@ and developed anew (trainings.lightglue.homographies). Stage 2 mixes them with p
 and trains the confidence heads. Every pair is cut to equally many keypoints, turned and scaled at random, so that no
 two steps see the same. The learning rate falls along a cosine; what is kept is a moving average of the weights.
 
+With learned features stage 2 has pairs of photographs, too, by the reference reconstruction of the real blocks
+(trainings.lightglue.photographs), and in three fifths of the pairs the network is told where inexact poses expect each
+keypoint on the ground.
+
 Validation knows neither the pictures nor the scenes: homography pairs of --unseen and of two rendered blocks that are
-left out, and the pairs of these two. Beside it stands the mutual ratio test (0.8) on the same keypoints.
+left out, the pairs of these two, and with learned features the photographs of --unseen. Beside it stands the mutual
+ratio test (0.8) on the same keypoints.
 
 On the CPU and on a CUDA device in bfloat16; a CUDA device takes larger batches, so that as many pairs are fewer steps:
-what ships was trained on a CPU. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on
-where it was; OUT/recipe.json makes sure that it is the same run. Writes
+what ships for SIFT was trained on a CPU, for learned features on a GPU. OUT/data and OUT/state.pt are kept: a killed
+run, or one ended by --minutes, goes on where it was; OUT/recipe.json makes sure that it is the same run. Writes
 OUT/lightglue.safetensors (float16, with the calibration of its scores on the validation pairs), OUT/log.json,
 OUT/curves.png and OUT/reliability.png.
 """
@@ -24,7 +30,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,9 +59,7 @@ from trainings.runs import (
     training_device,
 )
 
-DIMENSIONS = Dimensions(
-    input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True, knows_ground=True
-)
+DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True)
 DECAY, CLIP = 0.999, 1.0
 ALL_KEYPOINTS = 4096
 # Arguments of which another value makes other data, and another run.
@@ -145,10 +149,18 @@ class Run:
         save_state(path, self.seen, self.log, self.network, self.average, self.optimiser)
 
     @classmethod
-    def begin(cls, path: Path, device: str, rate: float, seed: int, start: Path | None = None) -> Run:
+    def begin(
+        cls,
+        path: Path,
+        device: str,
+        rate: float,
+        seed: int,
+        start: Path | None = None,
+        dimensions: Dimensions | None = None,
+    ) -> Run:
         """Where the state file `path` left it, else from the weights `start`, else from nothing."""
         torch.manual_seed(seed)
-        network = load_lightglue(start) if start else LightGlue(DIMENSIONS)
+        network = load_lightglue(start) if start else LightGlue(dimensions or DIMENSIONS)
         network = network.to(device).requires_grad_(True)
         run = cls(network, copy.deepcopy(network), torch.optim.AdamW(network.parameters(), rate), 0, [])
         run.seen, run.log = load_state(path, run.network, run.average, run.optimiser, device=device)
@@ -163,7 +175,8 @@ def train(args: argparse.Namespace, device: str, spent_s: float = 0.0) -> Run | 
     stage2 = read_all(args.out / "data" / "stage2", read_block)
     sets = validation_sets(args.out / "data")
     state, started = args.out / "state.pt", time.monotonic()
-    run = Run.begin(state, device, args.rate, args.seed, args.start)
+    dimensions = replace(DIMENSIONS, knows_ground=args.features == "learned")
+    run = Run.begin(state, device, args.rate, args.seed, args.start, dimensions)
     print(f"{len(stage1)} homography pairs, {len(stage2)} rendered pairs, {run.seen} of {total} pairs seen", flush=True)
     losses: list[tuple[float, float, float]] = []
     batches = Batches(stage1, stage2, plan, args.batch, run.seen, args.seed)

@@ -35,8 +35,9 @@ MOST_PAIRS = 400  # of a block, evenly over all that overlap
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """places_px of the side are undistorted. inverse_depths: (N, HEIGHTS), of the keypoints."""
+    """name: of the image. places_px of the side are undistorted. inverse_depths: (N, HEIGHTS), of the keypoints."""
 
+    name: str
     camera: Camera
     pose: Pose
     side: Seen
@@ -77,7 +78,7 @@ def pictures_of(folder: Path, recipe: tuple[str, ...]) -> list[Picture]:
             side = Seen(**{**raw.arrays(), "places_px": undistort(camera, raw.places_px).astype(np.float32)})
             depths = _inverse_depths(camera, pose, side.places_px.astype(np.float64), points_m)
             if depths is not None:
-                found.append(Picture(camera, pose, side, depths))
+                found.append(Picture(image.name, camera, pose, side, depths))
     return found
 
 
