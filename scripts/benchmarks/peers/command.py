@@ -52,8 +52,13 @@ from benchmarks.tables import (
 
 THREADS = 2
 ENOUGH_CORRECT = 30
+# Guided search and the network for every pair, as the published chains.
+_LIGHTGLUE = (
+    "match=lightglue-learned,match.guided=true,match.network_below_matches=100000,match.guide_below_matches=100000"
+)
 METHODS = (
-    "oblique,fusion,baseline,SIFT=opencv-sift,pycolmap,pycolmap-guided,aliked@ground,"
+    f"oblique,oblique+lightglue=oblique[{_LIGHTGLUE}],fusion,baseline,"
+    "SIFT=opencv-sift,pycolmap,pycolmap-guided,aliked@ground,"
     "aliked+lightglue,aliked+lightglue@ground,disk+lightglue@ground,xfeat+lighterglue@ground"
 )
 _FIGURES = ("possible", "kept", "correct", "median_error_px")
