@@ -16,7 +16,8 @@ from trainings.context import data
 from trainings.context.validation import compared
 
 from aeromatch_cli.nets.context import NEIGHBOURS, Context, evened, layout_of, load_context
-from aeromatch_cli.strategies.extractors.context import as_bytes, context_inputs, from_bytes
+from aeromatch_cli.nets.descriptor_bytes import as_bytes, from_bytes
+from aeromatch_cli.strategies.extractors.context import context_inputs
 from aeromatch_cli.strategies.extractors.detection import Raw
 
 

@@ -278,8 +278,8 @@ def test_other_descriptors_are_refused(weights: str) -> None:
 
 def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    monkeypatch.setattr("aeromatch_cli.nets.files.SHIPPED_LIGHTGLUE", tmp_path / "absent.safetensors")
-    with pytest.raises(ConfigError, match=r"needs a weights file.*aeromatch weights add"):
+    monkeypatch.setattr("aeromatch_cli.nets.files.SHIPPED_FOLDER", tmp_path)
+    with pytest.raises(ConfigError, match=r"lightglue.safetensors is missing: install aeromatch again"):
         LightGlue().fingerprint_files()
     with pytest.raises(ConfigError, match=r"no such file.*aeromatch weights add"):
         LightGlue(weights=str(tmp_path / "absent.pth"))(features(3), features(3), GEOMETRY)

@@ -143,4 +143,4 @@ def test_in_bfloat16_the_position_code_is_computed_in_full() -> None:
     for one, other in zip(exact, code, strict=True):
         torch.testing.assert_close(one, other, atol=1e-6, rtol=0.0)
     states, turned = coarse.begin(Side(places, torch.randn(1, 2, 128)))
-    assert {states.dtype, *(part.dtype for part in turned)} == {torch.bfloat16}
+    assert {states.dtype, *(part.dtype for part in turned.picture)} == {torch.bfloat16}

@@ -15,11 +15,12 @@ from trainings.lightglue.validation import Found, by_network, compared, judged
 
 from aeromatch_cli.geometry.cameras import distort
 from aeromatch_cli.lab.synthetic import load_truth, render_block
-from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE, shipped_path
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 
 pytestmark = pytest.mark.slow
 
+LIGHTGLUE = shipped_path("lightglue")
 # Far from the seeds of scripts/training_blocks.
 SEED = 90210
 
@@ -40,7 +41,7 @@ def pairs(folder: Path) -> list[Pair]:
 @pytest.fixture(scope="module")
 def answers(pairs: list[Pair]) -> tuple[Found, Found]:
     """What the mutual ratio test and the network find."""
-    return compared(load_lightglue(SHIPPED_LIGHTGLUE), pairs)
+    return compared(load_lightglue(LIGHTGLUE), pairs)
 
 
 def test_the_network_recalls_more_at_the_ratio_tests_precision(answers: tuple[Found, Found]) -> None:
@@ -53,14 +54,14 @@ def test_the_network_recalls_more_at_the_ratio_tests_precision(answers: tuple[Fo
 
 def test_bfloat16_costs_next_to_nothing(pairs: list[Pair]) -> None:
     """On some of the pairs: it is slow where the processor lacks it."""
-    exact, coarse = load_lightglue(SHIPPED_LIGHTGLUE), load_lightglue(SHIPPED_LIGHTGLUE).with_layers_in(torch.bfloat16)
+    exact, coarse = load_lightglue(LIGHTGLUE), load_lightglue(LIGHTGLUE).with_layers_in(torch.bfloat16)
     (ratio, network), (_, found) = (compared(one, pairs[:4]) for one in (exact, coarse))
     assert found.recall_at(ratio.precision) == pytest.approx(network.recall_at(ratio.precision), abs=0.01)
 
 
 def test_scores_mean_what_they_say(answers: tuple[Found, Found]) -> None:
     _, network = answers
-    rows = network.reliability(read_calibration(SHIPPED_LIGHTGLUE))
+    rows = network.reliability(read_calibration(LIGHTGLUE))
     total = sum(matches for _, _, matches, _, _ in rows)
     # So few keypoints are fewer than the scores were calibrated with: partners are missing, and fewer matches right.
     assert sum(matches * abs(mean - right) for _, _, matches, mean, right in rows) / total < 0.1

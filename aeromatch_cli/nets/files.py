@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 # Weights that come with the package, each beside its model card.
 SHIPPED_FOLDER = Path(__file__).parent / "trained"
 
-SHIPPED_LIGHTGLUE = SHIPPED_FOLDER / "lightglue.safetensors"
-
 _SUMS = "SHA256SUMS"  # of what ships, as sha256sum writes and checks them
 
 SUFFIXES = (".safetensors", ".pth", ".pt")

@@ -21,9 +21,10 @@ from pydantic import Field
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.descriptor_bytes import as_bytes
 from aeromatch_cli.nets.precision import DEVICE, Device, Precision, check_device, device_of
 from aeromatch_cli.strategies import ViewPixels
-from aeromatch_cli.strategies.extractors.context import as_bytes, with_context
+from aeromatch_cli.strategies.extractors.context import with_context
 from aeromatch_cli.strategies.extractors.described import Described, pixels_field
 from aeromatch_cli.strategies.extractors.detection import Raw, balanced, detect, sift_detector
 from aeromatch_cli.strategies.extractors.heat import heat_keypoints
@@ -184,7 +185,7 @@ class Learned(Described):
         return replace(raw, orientations_deg=angles)
 
     def described(self, raw: Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
-        """Descriptor bytes (N, 128), see `context.as_bytes`."""
+        """Descriptor bytes (N, 128), see `as_bytes`."""
         from aeromatch_cli.nets.geodesc import describe
 
         found = np.zeros((len(raw.view_idx), self.descriptor_length), np.float32)

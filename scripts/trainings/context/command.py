@@ -33,8 +33,9 @@ import torch
 from torch import Tensor
 
 from aeromatch_cli.nets.context import Context, load_context
+from aeromatch_cli.nets.descriptor_bytes import from_bytes
 from aeromatch_cli.nets.precision import has_bfloat16
-from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse, from_bytes
+from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse
 from aeromatch_cli.strategies.extractors.detection import Raw
 from aeromatch_cli.strategies.extractors.learned import Learned
 from trainings.blocks import LEFT_OUT, add_blocks, numbers, render

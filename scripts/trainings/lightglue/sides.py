@@ -41,7 +41,7 @@ class Seen:
 
 
 def seen(features: Features, view: int = 0, *, signed: bool = False) -> Seen:
-    """A view of extracted features; places are source pixels. signed: of learned ones (`extractors.context`)."""
+    """A view of extracted features; places are source pixels. signed: of learned ones (`nets.descriptor_bytes`)."""
     rows = np.flatnonzero(features.view_idx == view)
     descriptors = features.descriptors[rows]
     return Seen(

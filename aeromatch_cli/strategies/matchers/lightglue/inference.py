@@ -19,8 +19,8 @@ from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, PairGe
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.geometry.prediction import ground_places
+from aeromatch_cli.nets.descriptor_bytes import from_bytes
 from aeromatch_cli.nets.precision import Device, Precision, device_of, layer_type
-from aeromatch_cli.strategies.extractors.context import from_bytes
 
 # Around the keypoints that are left of a view; training takes it from here.
 FRAME_PX = 4.0
@@ -46,8 +46,9 @@ class NetworkInput:
 
 
 def network_input(features: Features, view: int, kept: BoolArray, most: int, *, signed: bool = False) -> NetworkInput:
-    """Of one view, such keypoints as are `kept` (K,), the strongest `most` of them. signed: the descriptors are bytes of
-    values with a sign, as of learned features.
+    """Of one view, such keypoints as are `kept` (K,), the strongest `most` of them.
+
+    signed: their descriptors are bytes of values with a sign, as those of learned features.
 
     What is left of a view has a frame of its own, as in training.
     """
