@@ -37,7 +37,8 @@ _SOME = ("sheffield", "caliterra", "brighton")
 _MOST = ("sheffield", "caliterra", "seneca", "brighton")
 # Real blocks whose pictures a network has seen in training, as its card says (nets/trained/*.md).
 TRAINED_ON: Mapping[str, tuple[str, ...]] = {
-    "context": (), "detector": _MOST, "geodesc": _MOST, "lightglue": _SOME, "orientation": _MOST, "shadow": (),
+    "context": (), "detector": _MOST, "geodesc": _MOST, "lightglue": _SOME, "lightglue-learned": _MOST,
+    "orientation": _MOST, "shadow": (),
 }  # fmt: skip
 _FEATURES = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX"}  # flag of the processor: its name
 
