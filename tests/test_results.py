@@ -79,7 +79,7 @@ def test_commands_are_printed_instead_of_run(capsys: pytest.CaptureFixture[str])
     asked = ["results", "--only", "growth,auto", "--list"]
     assert launcher.main(asked) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "# growth: about 6 minutes"
+    assert lines[0] == "# growth: about 5 minutes"
     assert [line.split()[:2] for line in lines if line[0] != "#"] == [
         ["scripts/bench", name] for name in ("growth", "auto", "auto", "auto")
     ]
