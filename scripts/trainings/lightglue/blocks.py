@@ -12,10 +12,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.config import load
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.lab.synthetic import Truth, load_truth
@@ -85,6 +87,21 @@ def prepared(folder: Path, workspace: str, changes: Sequence[str]) -> Context:
     """A rendered block as preset `baseline` with these settings reads it, with noisy poses."""
     block = {"images": str(folder / "images"), "poses": str(folder / "poses_noisy.csv")}
     block["cameras"] = str(folder / "block.json")
+    return _prepared(block, workspace, changes)
+
+
+def prepared_reference(
+    folder: Path, workspace: str, changes: Sequence[str], size_px: int
+) -> tuple[Context, FloatArray]:
+    """A real block, pictures of at most this size, with the poses of its reference, and the points (P, 3) of that."""
+    reference = folder / "reference"
+    block = {"images": str(folder / "images"), "poses": str(reference / "poses.csv"), "max_size_px": size_px}
+    context = _prepared(block | {"cameras": str(reference / "block.json")}, workspace, changes)
+    with np.load(reference / "points.npz") as archive:
+        return context, archive["xyz"] - np.asarray(context.block.origin_m)
+
+
+def _prepared(block: Mapping[str, Any], workspace: str, changes: Sequence[str]) -> Context:
     top = {"workspace": workspace, "run": {"executor": "serial", "jobs": 1}}
     settings = load("baseline", ["orient=none", *changes], block, **top)
     return pairs.prepare(settings, Executor("serial", 1))[0]

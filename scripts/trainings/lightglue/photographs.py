@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, FloatArray, Pose
-from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.geometry.cameras import calibration_matrix, undistort
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, symmetric_distance_px
-from aeromatch_cli.stages import extract, pairs
-from trainings.lightglue.blocks import LEAST_PARTNERS, Pair
+from aeromatch_cli.geometry.prediction import homogeneous
+from aeromatch_cli.stages import extract
+from trainings.lightglue.blocks import LEAST_PARTNERS, Pair, prepared_reference
 from trainings.lightglue.sides import UNKNOWN, Array, Partners, Seen, partners, seen
 
 SIZE_PX, KEYPOINTS = 1280, 2000
@@ -57,15 +56,9 @@ def photograph_pairs(folder: Path, recipe: tuple[str, ...], *, most: int = MOST_
 
 def pictures_of(folder: Path, recipe: tuple[str, ...]) -> list[Picture]:
     """Every picture of a block, in its ground view."""
-    reference = folder / "reference"
-    block = {"images": str(folder / "images"), "poses": str(reference / "poses.csv"), "max_size_px": SIZE_PX}
-    block["cameras"] = str(reference / "block.json")
     with tempfile.TemporaryDirectory() as scratch:
-        top = {"workspace": scratch, "run": {"executor": "serial", "jobs": 1}}
-        changes = ["orient=none", *recipe, f"extract.keypoints={KEYPOINTS}", "pairs=exhaustive"]
-        context = pairs.prepare(load("baseline", changes, block, **top), Executor("serial", 1))[0]
-        with np.load(reference / "points.npz") as archive:
-            points_m = archive["xyz"] - np.asarray(context.block.origin_m)
+        changes = (*recipe, f"extract.keypoints={KEYPOINTS}", "pairs=exhaustive")
+        context, points_m = prepared_reference(folder, scratch, changes, SIZE_PX)
         found = []
         for image in context.block.images:
             task = extract.task_of(context, image.image_id)
@@ -113,9 +106,7 @@ def truth_of(picture0: Picture, picture1: Picture) -> Partners:
 def _place_in(picture: Picture, other: Picture) -> FloatArray:
     """(N, 2) where keypoints lie in the other picture, at that of the heights around which a keypoint there is nearest;
     NaN outside of it."""
-    calibration = calibration_matrix(picture.camera)
-    places = picture.side.places_px.astype(np.float64)
-    rays = np.column_stack([places, np.ones(len(places))]) @ np.linalg.inv(calibration).T
+    rays = homogeneous(picture.camera, picture.side.places_px.astype(np.float64))
     rays = rays @ np.asarray(picture.pose.world_rotation)
     points = picture.pose.center_m + rays[:, None] / picture.inverse_depths[..., None]
     seen_there = (points - other.pose.center_m) @ np.asarray(other.pose.world_rotation).T

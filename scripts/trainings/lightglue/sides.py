@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from aeromatch_cli.data import Features
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.nets.descriptor_bytes import BYTE_ZERO
 from aeromatch_cli.strategies.matchers.lightglue.inference import wrapped_rad
 
 CORRECT_PX, WRONG_PX = 3.0, 5.0  # a partner lies within the one; without any within the other there is none
@@ -48,7 +49,7 @@ def seen(features: Features, view: int = 0, *, signed: bool = False) -> Seen:
         points_px=(features.view_keypoints_px[rows] + np.float32(COLMAP_OFFSET_PX)).astype(np.float32),
         sizes_px=features.view_size_px[rows].astype(np.float32),
         angles_rad=wrapped_rad(features.view_orientation_deg[rows]),
-        descriptors=(descriptors.astype(np.int16) - 128).astype(np.int8) if signed else descriptors,
+        descriptors=(descriptors.astype(np.int16) - BYTE_ZERO).astype(np.int8) if signed else descriptors,
         size_px=features.view_sizes_px[view].astype(np.float32),
         places_px=features.keypoints_px[features.descriptor_keypoint_idx[rows]].astype(np.float32),
     )

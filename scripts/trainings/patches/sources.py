@@ -9,18 +9,15 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from aeromatch_cli.config import load
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
-from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.frames import apply_homography, homography_jacobians
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.lab.synthetic import load_truth
 from aeromatch_cli.lab.synthetic.truth import Truth
-from aeromatch_cli.stages import pairs
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT
 from trainings.lightglue import homographies
-from trainings.lightglue.blocks import prepared
+from trainings.lightglue.blocks import prepared, prepared_reference
 from trainings.patches.sights import Picture, Sight, sights_of
 from trainings.patches.tracks import MARGIN, STORED_PX, Look, Spots, Tracks, assembled, part, tracks_of
 
@@ -90,16 +87,11 @@ def reference(folder: Path, name: str) -> dict[str, Tracks]:
     No detector and no occlusion: sizes are drawn, the surface is taken for level, and a patch stays only where it
     correlates with the others of its point.
     """
-    block = {"images": str(folder / "images"), "poses": str(folder / "reference" / "poses.csv")}
-    block |= {"cameras": str(folder / "reference" / "block.json"), "max_size_px": REAL_SIZE_PX}
     rng = np.random.default_rng([len(name), *name.encode(), 32])
     with tempfile.TemporaryDirectory() as scratch:
-        top = {"workspace": scratch, "run": {"executor": "serial", "jobs": 1}}
-        settings = load("baseline", ["orient=none", "simulate.keep_source=true", "pairs=exhaustive"], block, **top)
-        context = pairs.prepare(settings, Executor("serial", 1))[0]
+        changes = ("simulate.keep_source=true", "pairs=exhaustive")
+        context, points_m = prepared_reference(folder, scratch, changes, REAL_SIZE_PX)
         sights = sights_of(context, None, None, {})
-    with np.load(folder / "reference" / "points.npz") as archive:
-        points_m = archive["xyz"] - np.asarray(context.block.origin_m)
     points_m = points_m[rng.permutation(len(points_m))[:REAL_TRACKS]]
     gsd_m = context.block.gsd_m
     assert gsd_m is not None

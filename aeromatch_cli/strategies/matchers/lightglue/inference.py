@@ -71,7 +71,7 @@ def network_input(features: Features, view: int, kept: BoolArray, most: int, *, 
         points_px=points,
         scales_px=features.view_size_px[rows].astype(np.float32) / 2.0,
         orientations_rad=wrapped_rad(features.view_orientation_deg[rows]),
-        descriptors=_of_unit_length(from_bytes(features.descriptors[rows]) if signed else features.descriptors[rows]),
+        descriptors=_as_float(features.descriptors[rows], signed=signed),
         size_px=size_px,
     )
 
@@ -170,9 +170,11 @@ def wrapped_rad(angles_deg: FloatArray) -> FloatArray:
     return np.deg2rad(180.0 - np.mod(180.0 - degrees, 360.0)).astype(np.float32)
 
 
-def _of_unit_length(descriptors: NDArray[Any]) -> FloatArray:
-    """float32; what is stored as bytes regains unit length."""
-    values = descriptors.astype(np.float32)
+def _as_float(descriptors: NDArray[Any], *, signed: bool) -> FloatArray:
+    """float32 descriptors; those stored as bytes (RootSIFT x 512, or signed) regain unit length."""
+    if descriptors.dtype != np.uint8:
+        return descriptors.astype(np.float32)
+    values = from_bytes(descriptors) if signed else descriptors.astype(np.float32)
     return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6))
 
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison
-from aeromatch_cli.strategies.matchers.lightglue.inference import NetworkInput, network_input, with_expected_places
+from aeromatch_cli.strategies.matchers.lightglue.inference import NetworkInput, with_expected_places
 from aeromatch_cli.strategies.matchers.lightglue.matcher import Attention
 
 
@@ -22,6 +22,7 @@ class LearnedLightGlue(Attention):
     version: ClassVar[int] = 1
     reads_descriptors: ClassVar[str] = "GeoDesc"
     shipped: ClassVar[str] = "lightglue-learned"
+    signed: ClassVar[bool] = True
     name: Literal["lightglue-learned"] = "lightglue-learned"
     expect_places: bool = Field(
         True, description="Tell the network where poses and ground expect each keypoint, where they are known."
@@ -35,8 +36,7 @@ class LearnedLightGlue(Attention):
         self, comparison: Comparison, view0: int, view1: int, shown: tuple[BoolArray, BoolArray]
     ) -> tuple[NetworkInput, NetworkInput]:
         """With the expected places."""
-        sides = (comparison.features0, view0, shown[0]), (comparison.features1, view1, shown[1])
-        side0, side1 = (network_input(*side, self.max_keypoints, signed=True) for side in sides)
+        side0, side1 = super().inputs(comparison, view0, view1, shown)
         if not self.expect_places:
             return side0, side1
         return with_expected_places(side0, side1, (comparison.features0, comparison.features1), comparison.geometry)

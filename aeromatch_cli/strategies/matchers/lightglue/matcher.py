@@ -40,11 +40,12 @@ class Attention(Search):
     """LightGlue (Lindenberger et al., ICCV 2023) for pairs in which the ratio test finds few matches.
 
     Without `weights`, those that ship with the package, trained on aerial images (nets/trained/*.md).
-    shipped: their file.
+    shipped: their file. signed: descriptors are bytes of values with a sign (`nets.descriptor_bytes`).
     """
 
     network: ClassVar[bool] = True
     shipped: ClassVar[str]
+    signed: ClassVar[bool] = False
     name: str
     network_below_matches: int = Field(
         250,
@@ -175,7 +176,7 @@ class Attention(Search):
     ) -> tuple[NetworkInput, NetworkInput]:
         """What the network is given of two views. shown: (K0,), (K1,) the keypoints that the other image may show."""
         sides = (comparison.features0, view0, shown[0]), (comparison.features1, view1, shown[1])
-        side0, side1 = (network_input(*side, self.max_keypoints) for side in sides)
+        side0, side1 = (network_input(*side, self.max_keypoints, signed=self.signed) for side in sides)
         return side0, side1
 
     @property
