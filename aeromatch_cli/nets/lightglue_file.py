@@ -24,8 +24,9 @@ _LAYER_KEY = re.compile(r"^transformers\.(\d+)\.")
 _POSITION_KEY, _GROUND_KEY = "posenc.Wr.weight", "groundenc.Wr.weight"
 _WIDTH_KEY = "transformers.0.self_attn.out_proj.weight"
 _PROJECTION_KEY = "input_proj.weight"
-# Entry of a safetensors file's metadata: slope and offset, separated by a space.
-CALIBRATION_KEY = "calibration"
+# Entries of a safetensors file's metadata: slope and offset, separated by a space; the descriptors that it was trained
+# on, as extractors name theirs ("RootSIFT", "GeoDesc").
+CALIBRATION_KEY, DESCRIPTORS_KEY = "calibration", "descriptors"
 
 
 @dataclass(frozen=True)
@@ -54,17 +55,9 @@ class Calibration:
 
 def read_calibration(path: Path) -> Calibration:
     """Of a weights file; the neutral one where it has none. Raises ConfigError where what it has is no calibration."""
-    from safetensors import SafetensorError, safe_open
-
-    if path.suffix != ".safetensors":
+    text = _metadata(path).get(CALIBRATION_KEY)
+    if text is None:
         return Calibration()
-    try:
-        with safe_open(path, framework="np") as content:
-            text = (content.metadata() or {}).get(CALIBRATION_KEY)
-        if text is None:
-            return Calibration()
-    except (SafetensorError, OSError) as error:
-        raise ConfigError(f"weights file {path}: its calibration cannot be read ({error})") from error
     try:
         slope, offset = (float(part) for part in text.split())
     except ValueError:
@@ -72,6 +65,24 @@ def read_calibration(path: Path) -> Calibration:
     if not (slope > 0.0 and math.isfinite(slope + offset)):
         raise ConfigError(f"weights file {path}: calibration {text!r} is no positive slope and an offset")
     return Calibration(slope, offset)
+
+
+def read_descriptors(path: Path) -> str:
+    """Which descriptors a weights file was trained on, "" where it does not say."""
+    return _metadata(path).get(DESCRIPTORS_KEY, "")
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    """What a weights file says beside its tensors. Raises ConfigError where it cannot be read."""
+    from safetensors import SafetensorError, safe_open
+
+    if path.suffix != ".safetensors":
+        return {}
+    try:
+        with safe_open(path, framework="np") as content:
+            return content.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise ConfigError(f"weights file {path}: what it says of itself cannot be read ({error})") from error
 
 
 def canonical_keys(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

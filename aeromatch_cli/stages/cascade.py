@@ -32,6 +32,7 @@ from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.strategies.matchers.descriptors.search import EVERY_PAIR
+from aeromatch_cli.strategies.matchers.lightglue.learned import LearnedLightGlue
 from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
 from aeromatch_cli.strategies.simulators.plane import PlaneViews
 from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, Step
@@ -88,7 +89,9 @@ _SETTINGS_OF: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]
             device=step.device,
             **_reduction(settings),
         ),
-        "match": Bidirectional(ratio=0.9, guided=True),
+        "match": LearnedLightGlue(precision=step.precision, device=step.device)
+        if step.lightglue
+        else Bidirectional(ratio=0.9, guided=True),
     },
 }
 

@@ -98,6 +98,8 @@ class Context:
     settings: the resolved settings. workspace: the paths of the workspace's files. executor: runs the tasks of stages.
     given: what was given of the block.
     block: images, cameras, poses and ground in the world frame, oriented once `stages.orient` has run.
+    frames: image_id -> number of the frame of its own, from 1, of an image that nothing ties to the world; absent where
+    it lies in the world.
     pairs: the pairs of pairs.csv, in its order.
     scope: the part of the work that is done.
     index: what is known of the files of the workspace.
@@ -111,6 +113,7 @@ class Context:
     executor: Executor
     given: Given
     block: Block
+    frames: Mapping[str, int] = field(default_factory=dict)
     pairs: tuple[Pair, ...] = ()
     scope: Scope = field(default_factory=Scope)
     index: Index = field(default_factory=Index, repr=False)
@@ -219,30 +222,37 @@ class Context:
         return _image_index(self.block)
 
     def geometry(self, pair: Pair) -> PairGeometry:
+        """Return what is known of a pair. Poses in frames of their own say nothing of images outside these."""
         images = self.image_by_id
+        related = self._share_frame(pair.image_id0, pair.image_id1)
         heights = [h for h in (self.ground_z_m(pair.image_id0), self.ground_z_m(pair.image_id1)) if h is not None]
         return PairGeometry(
             pair=pair,
             camera0=self.block.camera(images[pair.image_id0]),
             camera1=self.block.camera(images[pair.image_id1]),
-            pose0=self.pose(pair.image_id0),
-            pose1=self.pose(pair.image_id1),
+            pose0=self.pose(pair.image_id0) if related else None,
+            pose1=self.pose(pair.image_id1) if related else None,
             ground_z_m=sum(heights) / len(heights) if heights else None,
         )
 
     def lacks_attitude(self, image_id: str) -> bool:
-        """Whether an image, or one that it is paired with, has no attitude: north-up views of both cannot be
-        compared then, the source images can."""
+        """Whether an image, or one that it is paired with, has no attitude in a common frame: north-up views of both
+        cannot be compared then, the source images can."""
         ids = (image_id, *(other for other, _ in self._paired.get(image_id, ())))
-        poses = [self.pose(i) for i in ids]
+        poses = [self.pose(i) if self._share_frame(image_id, i) else None for i in ids]
         return any(pose is None or pose.world_rotation is None for pose in poses)
+
+    def _share_frame(self, image_id0: str, image_id1: str) -> bool:
+        """Whether the poses of two images, as far as there are two, lie in one frame."""
+        posed = self.block.poses.keys() >= {image_id0, image_id1}
+        return not posed or self.frames.get(image_id0) == self.frames.get(image_id1)
 
     def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
         """Return from where else the ground of an image is looked at: the images it is paired with that have an
         attitude."""
         found = []
         for other_id, overlap in self._paired.get(image_id, ()):
-            pose = self.pose(other_id)
+            pose = self.pose(other_id) if self._share_frame(image_id, other_id) else None
             if pose is not None and pose.world_rotation is not None:
                 camera = self.working_camera(self.image_by_id[other_id])
                 found.append(Neighbour(camera, pose, overlap, self.ground_z_m(other_id)))
@@ -277,6 +287,8 @@ class Context:
             parts["camera"] = self.block.camera(self.image_by_id[image_id])
         if "pose" in needs:
             parts["pose"] = (pose.center_m, pose.world_rotation) if pose else None
+            if image_id in self.frames:
+                parts["frame"] = self.frames[image_id]
         if "sigma" in needs:
             parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
         if "ground" in needs:

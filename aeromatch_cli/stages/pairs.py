@@ -74,10 +74,11 @@ def prepare(
     known += looks
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
     report.started += oriented.seconds  # has its own report
-    context = _with_ground(context, found)
+    groups = orient.groups(context)
+    context = _with_ground(replace(context, frames=_frames(groups)), found)
     report.fingerprint = _fingerprint(context)
     pairs = _listed(context, report, anew=overwrite or dry)
-    summary, pairs_csv = summarise(context.block, pairs, _apart(orient.groups(context))), pairs_text(pairs)
+    summary, pairs_csv = summarise(context.block, pairs, _apart(groups)), pairs_text(pairs)
     as_oriented = oriented.result if isinstance(oriented.result, OrientResult) else None
     oriented_lines = [] if as_oriented is None else orientation_lines(as_oriented, found.given.block, context.block)
     remarks = [] if as_oriented is None else as_oriented.remarks
@@ -104,6 +105,12 @@ def prepare(
         forget_absent(context)
         report.write(workspace)
     return context, oriented, report
+
+
+def _frames(groups: Sequence[Group]) -> dict[str, int]:
+    """image_id -> number of the frame of its own, from 1, of images of groups that nothing ties to the world."""
+    loose = [group for group in groups if group.kind == "level"]
+    return {image_id: number for number, group in enumerate(loose, start=1) for image_id in group.images}
 
 
 def _apart(groups: Sequence[Group]) -> set[str]:

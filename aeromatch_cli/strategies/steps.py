@@ -78,7 +78,7 @@ _PRECISION: Precision = Field(
 
 
 class LearnedFeatures(Step):
-    """Learned keypoints and descriptors on ground views, the ratio test from both images, guided search.
+    """Learned keypoints and descriptors on ground views, the ratio test from both images or LightGlue, guided search.
 
     Views are halved as by `extract=learned` itself, but never where `extract.pixels_per_keypoint` is 0.
     """
@@ -98,6 +98,11 @@ class LearnedFeatures(Step):
         "expected to bring this share more matches (0.7: 70 %). Larger: fewer pairs take it, less time; 100: none.",
     )
     keypoints: int | None = _KEYPOINTS
+    lightglue: bool = Field(
+        False,
+        description="Match the step's features by LightGlue, which is told where the poses expect each keypoint, as "
+        "well as by nearest neighbours. More matches of difficult pairs; half a second more per pair.",
+    )
     precision: Precision = _PRECISION
     device: Device = DEVICE
 

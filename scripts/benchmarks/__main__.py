@@ -12,6 +12,10 @@ TABLE: Table = {
     "results": ("benchmarks.results", "makes the tables of docs/results by running the standing benchmarks"),
     "auto": ("benchmarks.auto.command", "auto beside presets and peers, strategy by strategy, and on real blocks"),
     "peers": ("benchmarks.peers.command", "presets beside other programs on the same pairs, by truth"),
+    "anchors": (
+        "benchmarks.anchors.command",
+        "pairs of photographs whose truth others have measured, without any pose",
+    ),
     "calibration": (
         "benchmarks.calibration.command",
         "bundle adjustment of simulated tie points with real lenses, beside COLMAP, by exact truth",

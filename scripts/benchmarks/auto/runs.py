@@ -6,8 +6,9 @@ import argparse
 import csv
 import re
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
-from threading import Lock
+from threading import RLock
 
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.files import read_json, write_json
@@ -21,13 +22,19 @@ from benchmarks.tables import Row, plain
 from benchmarks.whole import budget_settings, evaluated, whole_run
 
 JUDGED = "auto"
-# Several settings of auto, which run at a time, start from one workspace.
-_making = Lock()
+# Of auto as it is: several settings of it, which run at a time, start from its one workspace.
+_making = RLock()
 _FIGURES = ("kept", "correct", "median_error_px")
 
 
 def rows_of(args: argparse.Namespace, block: Block, judged: Judged, method: str) -> list[Row]:
     """A row for each judged pair."""
+    with _making if method == JUDGED else nullcontext():
+        return _rows_on_file(args, block, judged, method)
+
+
+def _rows_on_file(args: argparse.Namespace, block: Block, judged: Judged, method: str) -> list[Row]:
+    """Made first where they are not there, or of other code."""
     peer = method in PEERS
     folder = args.out / "runs" / block.slug / re.sub(r"[^a-z0-9.]+", "-", method.lower()).strip("-")
     path = folder / "rows.json"
@@ -51,8 +58,7 @@ def _preset_rows(args: argparse.Namespace, block: Block, judged: Judged, method:
     settings = [*budget_settings(load(preset, own), args.keypoints), *own, "run.report=false"]
     start = None
     if preset == JUDGED and own:
-        with _making:
-            rows_of(args, block, judged, JUDGED)
+        rows_of(args, block, judged, JUDGED)
         start = folder.with_name(JUDGED) / "work"
     run = whole_run("run", preset, scene.images, work, extra=given, jobs=1, settings=settings, start=start)
     if not run.answer:

@@ -78,11 +78,19 @@ class Found:
     descriptors: float
 
 
+# Matches before any verification: points0_px, points1_px (M, 2) stored pixels, scores (M,), larger is better.
+Candidates = tuple[FloatArray, FloatArray, FloatArray]
+
+
 class Method(Protocol):
     """One way to match, for one scene: made in the process that uses it."""
 
     def features(self, image: str) -> Any:
         """Features of one image, decoding included; timed."""
+        ...
+
+    def candidates(self, image0: str, image1: str, features0: Any, features1: Any) -> Candidates:
+        """Matches of one pair before verification; only of methods that look at the stored pictures."""
         ...
 
     def match(self, image0: str, image1: str, features0: Any, features1: Any) -> Found:

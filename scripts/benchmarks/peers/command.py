@@ -52,12 +52,8 @@ from benchmarks.tables import (
 
 THREADS = 2
 ENOUGH_CORRECT = 30
-# Guided search and the network for every pair, as the published chains.
-_LIGHTGLUE = (
-    "match=lightglue-learned,match.guided=true,match.network_below_matches=100000,match.guide_below_matches=100000"
-)
 METHODS = (
-    f"oblique,oblique+lightglue=oblique[{_LIGHTGLUE}],fusion,baseline,"
+    "oblique,oblique+lightglue=oblique[match=lightglue-learned],fusion,baseline,"
     "SIFT=opencv-sift,pycolmap,pycolmap-guided,aliked@ground,"
     "aliked+lightglue,aliked+lightglue@ground,disk+lightglue@ground,xfeat+lighterglue@ground"
 )

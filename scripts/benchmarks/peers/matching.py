@@ -8,7 +8,7 @@ import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray, IntArray
 from aeromatch_cli.geometry.cameras import undistort
-from benchmarks.peers.base import Described, Found, Options, Scene, found
+from benchmarks.peers.base import Candidates, Described, Found, Options, Scene, found
 
 RATIO = 0.8
 # OpenCV's threshold of MAGSAC++ in px. From 0.5 to 4 px on rendered city and grass, correct matches grow by 1 % (SIFT)
@@ -85,8 +85,12 @@ class Peer:
     def __init__(self, scene: Scene, options: Options) -> None:
         self.scene, self.options = scene, options
 
-    def match(self, image0: str, image1: str, features0: Described, features1: Described) -> Found:
+    def candidates(self, image0: str, image1: str, features0: Described, features1: Described) -> Candidates:
+        del image0, image1
         rows, columns, scores = mutual_nearest(features0.descriptors, features1.descriptors, self.ratio)
-        points0, points1 = features0.places_px[rows], features1.places_px[columns]
+        return features0.places_px[rows], features1.places_px[columns], scores
+
+    def match(self, image0: str, image1: str, features0: Described, features1: Described) -> Found:
+        points0, points1, scores = self.candidates(image0, image1, features0, features1)
         kept = magsac(self.scene.cameras[image0], self.scene.cameras[image1], points0, points1)
         return found(features0, features1, points0[kept], points1[kept], scores[kept])

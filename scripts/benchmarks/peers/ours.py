@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.config import load
-from aeromatch_cli.data import Features, FloatArray, Pair
+from aeromatch_cli.data import Features, FloatArray, Matches, Pair
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.stages import extract
 from aeromatch_cli.stages import filter as filtering
 from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies.filters import apply_chain
-from benchmarks.peers.base import Found, Options, Scene, prepared
+from benchmarks.peers.base import Candidates, Found, Options, Scene, prepared
 
 
 class Preset:
@@ -51,13 +51,26 @@ class Preset:
         extract.run_task(task)
         return read_features(task.path)
 
+    def candidates(self, image0: str, image1: str, features0: Features, features1: Features) -> Candidates:
+        ids = self.id_of[image0], self.id_of[image1]
+        if ids not in self.pair_of:  # ids sort otherwise than names
+            points1, points0, scores = self.candidates(image1, image0, features1, features0)
+            return points0, points1, scores
+        matches = self._matches(self.pair_of[ids], features0, features1)
+        rows0, rows1 = matches.indices.T
+        points = features0.keypoints_px[rows0].astype(np.float64), features1.keypoints_px[rows1].astype(np.float64)
+        return *points, matches.scores.astype(np.float64)
+
+    def _matches(self, pair: Pair, features0: Features, features1: Features) -> Matches:
+        return self.context.settings.match(features0, features1, self.context.geometry(pair))
+
     def match(self, image0: str, image1: str, features0: Features, features1: Features) -> Found:
         ids = self.id_of[image0], self.id_of[image1]
         if ids not in self.pair_of:  # ids sort otherwise than names
             return _turned(self.match(image1, image0, features1, features0))
         pair: Pair = self.pair_of[ids]
         geometry = self.context.geometry(pair)
-        matches = self.context.settings.match(features0, features1, geometry)
+        matches = self._matches(pair, features0, features1)
         sides = [(features.keypoints_px, features.colours) for features in (features0, features1)]
         candidates = filtering.candidates(matches, *sides)
         seed = BlockState.of(self.context).seed(pair)

@@ -15,7 +15,18 @@ import numpy as np
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.loading import check_same_tensors
-from benchmarks.peers.base import Described, Found, Options, Scene, found, read_colour, read_weights, size_of, strongest
+from benchmarks.peers.base import (
+    Candidates,
+    Described,
+    Found,
+    Options,
+    Scene,
+    found,
+    read_colour,
+    read_weights,
+    size_of,
+    strongest,
+)
 from benchmarks.peers.matching import Peer, magsac
 
 _LIGHTGLUE: Mapping[str, Any] = {"input_dim": 128}
@@ -113,19 +124,23 @@ class WithLightGlue:
     def features(self, image: str) -> Described:
         return self.peer.features(image)  # type: ignore[no-any-return]
 
-    def match(self, image0: str, image1: str, features0: Described, features1: Described) -> Found:
+    def candidates(self, image0: str, image1: str, features0: Described, features1: Described) -> Candidates:
         import torch
 
+        del image0, image1
         sides = [_side(features) for features in (features0, features1)]
         if min(len(features0.places_px), len(features1.places_px)) < 2:
             nothing = np.zeros((0, 2))
-            return found(features0, features1, nothing, nothing, np.zeros(0))
+            return nothing, nothing, np.zeros(0)
         with torch.inference_mode():
             answer = self.network({"image0": sides[0], "image1": sides[1]})
         rows, columns = answer["matches"][0].numpy().T
-        points0, points1 = features0.places_px[rows], features1.places_px[columns]
-        kept = magsac(self.scene.cameras[image0], self.scene.cameras[image1], points0, points1)
         scores = answer["scores"][0].numpy().astype(np.float64)
+        return features0.places_px[rows], features1.places_px[columns], scores
+
+    def match(self, image0: str, image1: str, features0: Described, features1: Described) -> Found:
+        points0, points1, scores = self.candidates(image0, image1, features0, features1)
+        kept = magsac(self.scene.cameras[image0], self.scene.cameras[image1], points0, points1)
         return found(features0, features1, points0[kept], points1[kept], scores[kept])
 
 

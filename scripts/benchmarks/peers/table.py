@@ -30,7 +30,8 @@ def _superpoint(scene: Scene, options: Options) -> Method:
 
 
 _OF_ALIKED, _OF_DISK = "aliked_lightglue.pth", "disk_lightglue.pth"
-_FROM_PICTURES: Mapping[str, Make] = {
+# Peers that look at the stored pictures, and have `candidates`.
+FROM_PICTURES: Mapping[str, Make] = {
     "opencv-sift": OpenCvSift,
     "opencv-asift": OpenCvAsift,
     "aliked": Aliked,
@@ -44,10 +45,10 @@ _FROM_PICTURES: Mapping[str, Make] = {
 }
 ON_GROUND = "@ground"
 PEERS: Mapping[str, Make] = {
-    **_FROM_PICTURES,
+    **FROM_PICTURES,
     "pycolmap": Colmap,
     "pycolmap-guided": partial(Colmap, guided=True),
-    **{f"{name}{ON_GROUND}": partial(OnGround, peer=make) for name, make in _FROM_PICTURES.items()},
+    **{f"{name}{ON_GROUND}": partial(OnGround, peer=make) for name, make in FROM_PICTURES.items()},
 }
 # Peers that are networks: the files of their weights.
 _KEYNET = ("OriNet.pth", "keynet_pytorch.pth")

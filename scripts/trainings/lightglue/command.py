@@ -39,7 +39,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
-from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, load_lightglue
+from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, DESCRIPTORS_KEY, Calibration, load_lightglue
 from trainings.blocks import LEFT_OUT
 from trainings.lightglue.batches import Batch, batch_of, piece, unit
 from trainings.lightglue.blocks import LEAST_PARTNERS, Pair
@@ -62,6 +62,8 @@ from trainings.runs import (
 DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True)
 DECAY, CLIP = 0.999, 1.0
 ALL_KEYPOINTS = 4096
+# Of the features by --features: what their descriptors are called.
+DESCRIPTORS = {"sift": "RootSIFT", "learned": "GeoDesc"}
 # Arguments of which another value makes other data, and another run.
 OF_DATA, OF_RUN = ("features", "trained_on", "unseen", "groups", "blocks", "seed"), ("start", "scale", "batch", "rate")
 REPORT_EVERY, SAVE_EVERY = 16_000, 2_000  # pairs
@@ -273,8 +275,8 @@ def draw_curves(log: Log, path: Path) -> None:
     figure.savefig(path)
 
 
-def finish(run: Run, out: Path) -> None:
-    """Weights with their calibration, log and reliability plot."""
+def finish(run: Run, out: Path, descriptors: str) -> None:
+    """Weights with their calibration and the descriptors that they know, log and reliability plot."""
     from safetensors.torch import save_file
 
     network = run.average.eval()
@@ -283,7 +285,10 @@ def finish(run: Run, out: Path) -> None:
     sets = validation_sets(out / "data", (ALL_KEYPOINTS, ALL_KEYPOINTS))
     found = together([compared(network, pairs)[1] for name, pairs in sets.items() if name.startswith("rendered")])
     calibration = fitted(found)
-    metadata = {CALIBRATION_KEY: f"{calibration.slope:.4f} {calibration.offset:.4f}"}
+    metadata = {
+        CALIBRATION_KEY: f"{calibration.slope:.4f} {calibration.offset:.4f}",
+        DESCRIPTORS_KEY: descriptors,
+    }
     save_file(shipped(network), out / "lightglue.safetensors", metadata)
     (out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
     draw_reliability({"raw": Calibration(), "calibrated": calibration}, found, out / "reliability.png")
@@ -381,4 +386,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     run = None if args.only_data else train(args, device, time.time() - began)
     if run is not None:
-        finish(run, args.out)
+        finish(run, args.out, DESCRIPTORS[args.features])

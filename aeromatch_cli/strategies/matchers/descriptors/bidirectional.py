@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined
-from aeromatch_cli.strategies.matchers.descriptors.scan import mutual_nearest, ratios_of
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, ratio_test_both_ways
 from aeromatch_cli.strategies.matchers.descriptors.search import Search
 
 
@@ -32,19 +30,5 @@ class Bidirectional(Search):
     )
 
     def scan(self, comparison: Comparison) -> Found:
-        """Matches of all view pairs that are comparable, costs the larger d1/d2."""
-        parts = []
-        for views in comparison.view_pairs():
-            rows, columns, ratios = mutual_nearest(
-                views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=self.ratio, limits=views.limits
-            )
-            back = ratios_of(
-                views.descriptors1[columns],
-                views.descriptors0,
-                views.keypoint_idx0,
-                limits=None if views.limits is None else views.limits.seen_from(columns),
-            )
-            held = back < self.ratio
-            costs = np.maximum(ratios, back)[held]
-            parts.append(Found(views.of0[rows[held]], views.of1[columns[held]], costs))
-        return joined(parts)
+        """The ratio test from either image."""
+        return ratio_test_both_ways(comparison, self.ratio)

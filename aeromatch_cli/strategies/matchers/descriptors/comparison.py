@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, PairGeometry
 from aeromatch_cli.geometry.prediction import Windows
-from aeromatch_cli.strategies.matchers.descriptors.scan import Limits, mutual_nearest
+from aeromatch_cli.strategies.matchers.descriptors.scan import Limits, mutual_nearest, ratios_of
 
 # Largest distance to the nearest over that to the next other keypoint, where nothing else is said.
 RATIO = 0.8
@@ -125,4 +125,24 @@ def ratio_test(comparison: Comparison, ratio: float = RATIO) -> Found:
             views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=ratio, limits=views.limits
         )
         parts.append(Found(views.of0[rows], views.of1[columns], ratios))
+    return joined(parts)
+
+
+def ratio_test_both_ways(comparison: Comparison, ratio: float) -> Found:
+    """Mutual nearest neighbours of all view pairs that are comparable and hold the ratio from either image, costs the
+    larger d1/d2."""
+    parts = []
+    for views in comparison.view_pairs():
+        rows, columns, ratios = mutual_nearest(
+            views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=ratio, limits=views.limits
+        )
+        back = ratios_of(
+            views.descriptors1[columns],
+            views.descriptors0,
+            views.keypoint_idx0,
+            limits=None if views.limits is None else views.limits.seen_from(columns),
+        )
+        held = back < ratio
+        costs = np.maximum(ratios, back)[held]
+        parts.append(Found(views.of0[rows[held]], views.of1[columns[held]], costs))
     return joined(parts)

@@ -46,6 +46,25 @@ def finished(steps: Steps[T], run_network: Callable[[Sequence[Any]], Sequence[An
         return result
 
 
+def guided_field(*, default: bool) -> Any:
+    """The setting `guided` of one matcher."""
+    return Field(
+        default,
+        description="Guided search: match again within the windows predicted by the poses, then around the places "
+        "predicted by verified matches.",
+    )
+
+
+def guide_below_field(default: int) -> Any:
+    """The setting `guide_below_matches` of one matcher."""
+    return Field(
+        default,
+        ge=1,
+        description="Guided search and enhanced pictures are used only for pairs with fewer matches than this. "
+        "Larger: more pairs are searched again, more time.",
+    )
+
+
 class Search(Strategy):
     """A matcher that compares the views of similar direction of two images, with at most one match per keypoint.
 
@@ -63,17 +82,8 @@ class Search(Strategy):
         description="Largest angle between the directions of two simulated views that are compared, degrees. Larger: "
         "more view pairs, more time.",
     )
-    guided: bool = Field(
-        False,
-        description="Guided search: match again within the windows predicted by the poses, then around the places "
-        "predicted by verified matches.",
-    )
-    guide_below_matches: int = Field(
-        500,
-        ge=1,
-        description="Guided search and enhanced pictures are used only for pairs with fewer matches than this. "
-        "Larger: more pairs are searched again, more time.",
-    )
+    guided: bool = guided_field(default=False)
+    guide_below_matches: int = guide_below_field(500)
     sigmas: float = Field(
         3.0,
         gt=0.0,

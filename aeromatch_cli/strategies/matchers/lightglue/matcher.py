@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.precision import DEVICE, Device, Precision, check_device, device_of
 from aeromatch_cli.strategies.matchers.descriptors.assignment import one_to_one
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined, ratio_test
@@ -36,6 +37,17 @@ _DOUBTFUL = 0.7
 _SURER = (0.3, 0.5, 0.8)
 
 
+def network_below_field(default: int) -> Any:
+    """The setting `network_below_matches` of one matcher."""
+    return Field(
+        default,
+        ge=1,
+        description="The network runs only for pairs with fewer matches than this after the ratio test and guided "
+        "search (about half a second per pair). Larger: more pairs use it; above extract.keypoints, and "
+        "guide_below_matches too: every pair.",
+    )
+
+
 class Attention(Search):
     """LightGlue (Lindenberger et al., ICCV 2023) for pairs in which the ratio test finds few matches.
 
@@ -47,13 +59,7 @@ class Attention(Search):
     shipped: ClassVar[str]
     signed: ClassVar[bool] = False
     name: str
-    network_below_matches: int = Field(
-        250,
-        ge=1,
-        description="The network runs only for pairs with fewer matches than this after the ratio test and guided "
-        "search (about half a second per pair). Larger: more pairs use it; above extract.keypoints, and "
-        "guide_below_matches too: every pair.",
-    )
+    network_below_matches: int = network_below_field(250)
     weights: str | None = Field(
         None,
         description="Path of a weights file, or its name in the weights folder (`aeromatch weights list`); null = the "
@@ -115,11 +121,17 @@ class Attention(Search):
         (path,) = self.fingerprint_files()
         check_device(self.device)
         if self.weights is not None:
-            from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
+            from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration, read_descriptors
 
             network = load_lightglue(Path(path))
             check_length(network.dimensions.input_dim, descriptor_length)
             read_calibration(Path(path))
+            known = read_descriptors(Path(path)) or self.reads_descriptors
+            if known != self.reads_descriptors:
+                raise ConfigError(
+                    f"match.weights {self.weights!r} was trained on {known} descriptors, and match={self.name} "
+                    f"compares {self.reads_descriptors}: give weights trained on these, or leave match.weights out"
+                )
 
     def own_weights(self) -> tuple[str, ...]:
         """The file named by `weights`."""

@@ -1,0 +1,1 @@
+"""Pairs of photographs with truth that others have measured."""
