@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from make_lightglue import SIFT, features, seeded_tensors
+from safetensors.torch import load_file, save_file
 from trainings.lightglue.batches import as_side, expected, unit
 from trainings.lightglue.sides import Partners, Seen
 
 from aeromatch_cli.data import Camera, Pair, PairGeometry, Pose
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.prediction import ground_places
 from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.lightglue import LightGlue, Side
 from aeromatch_cli.nets.lightglue_batch import match_batch
 from aeromatch_cli.nets.lightglue_file import infer_dimensions, load_lightglue
-from aeromatch_cli.strategies.matchers.lightglue.inference import network_input, with_expected_places
+from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison
+from aeromatch_cli.strategies.matchers.descriptors.search import finished
+from aeromatch_cli.strategies.matchers.lightglue import learned
+from aeromatch_cli.strategies.matchers.lightglue.inference import NetworkInput, network_input, with_expected_places
+from aeromatch_cli.strategies.matchers.lightglue.learned import LearnedLightGlue
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue as SiftLightGlue
 
 KNOWING = replace(SIFT, knows_ground=True)
 EVERY_LAYER = {"threshold": 0.0, "depth_confidence": -1.0, "width_confidence": -1.0}
@@ -132,3 +142,52 @@ def test_descriptors_with_a_sign_keep_it() -> None:
 def test_the_network_that_ships_knows_the_ground() -> None:
     assert load_lightglue(shipped_path("lightglue-learned")).dimensions.knows_ground
     assert not load_lightglue(shipped_path("lightglue")).dimensions.knows_ground
+
+
+def compared() -> Comparison:
+    """Two pictures of one texture from straight above, 12 m apart."""
+    found = features(200)
+    poses = [Pose(np.array([east, 0.0, 100.0]), STRAIGHT_DOWN, 1.0, 1.0) for east in (0.0, 12.0)]
+    geometry = PairGeometry(Pair("a", "b", 1.0, 0.0, "overlap"), CAMERA, CAMERA, *poses, ground_z_m=0.0)
+    return Comparison(found, features(200), geometry, np.ones((1, 1), bool))
+
+
+def test_the_matcher_of_learned_features_guides_every_pair_and_begins_with_the_ratio_from_either_image() -> None:
+    matcher = LearnedLightGlue()
+    assert matcher.guided
+    assert min(matcher.guide_below_matches, matcher.network_below_matches) > matcher.max_keypoints
+    assert not SiftLightGlue().guided
+    first, expected_first = matcher.scan(compared()), Bidirectional(ratio=0.9).scan(compared())
+    assert len(first.rows) == 200
+    assert np.array_equal(first.rows, expected_first.rows)
+    assert np.array_equal(first.costs, expected_first.costs)
+
+
+@pytest.mark.parametrize(("with_places", "runs"), [(120, 1), (20, 2)])
+def test_places_that_hide_the_matches_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, with_places: int, runs: int
+) -> None:
+    asked: list[bool] = []
+
+    def answer(inputs: Sequence[tuple[NetworkInput, NetworkInput]]) -> list[tuple[np.ndarray, np.ndarray]]:
+        asked.extend(side.ground is not None for side, _ in inputs)
+        count = with_places if asked[-1] else 150
+        return [(np.repeat(np.arange(count), 2).reshape(-1, 2), np.full(count, 0.9))]
+
+    monkeypatch.setattr(learned, "most_evident", lambda _, sets: max(sets, key=lambda one: len(one.rows)))
+    found = finished(LearnedLightGlue().by_network(compared()), answer)
+    assert asked == [True, False][:runs]
+    assert len(found.rows) == (120 if runs == 1 else 150)
+    asked.clear()
+    finished(LearnedLightGlue(expect_places=False).by_network(compared()), answer)
+    assert asked == [False]
+
+
+def test_weights_of_other_descriptors_are_refused(tmp_path: Path) -> None:
+    """Both networks read 128 numbers a keypoint: what the file says tells them apart."""
+    with pytest.raises(ConfigError, match="was trained on GeoDesc descriptors, and match=lightglue compares RootSIFT"):
+        SiftLightGlue(weights=str(shipped_path("lightglue-learned"))).check_files(128)
+    LearnedLightGlue(weights=str(shipped_path("lightglue-learned"))).check_files(128)
+    unsaid = tmp_path / "own.safetensors"
+    save_file(load_file(shipped_path("lightglue-learned")), unsaid)
+    SiftLightGlue(weights=str(unsaid)).check_files(128)  # nothing says what it knows

@@ -40,7 +40,7 @@ from benchmarks.tables import Column, Row, code, grouped, interval, means, media
 SOLVED_PX = (5.0, 10.0)
 _PLANE_PX, _LINES_PX, _CONFIDENCE, _ITERATIONS = 3.0, 1.0, 0.9999, 10_000
 _FEWEST = 8
-_THREADS = 2
+_THREADS = 1
 METHODS = (
     "oblique,oblique+lightglue=oblique[match=lightglue-learned],own on SIFT=oblique[extract.detector=sift],baseline,"
     "SIFT=opencv-sift,aliked,aliked+lightglue,aliked-rot+lightglue,disk+lightglue,xfeat+lighterglue"
