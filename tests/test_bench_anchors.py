@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from benchmarks import __main__
-from benchmarks.anchors.command import error_px
+from benchmarks.anchors.judge import error_px
 from benchmarks.anchors.layouts import anchors_in, moved
 
 from aeromatch_cli.errors import InputError

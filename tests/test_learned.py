@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from pydantic import ValidationError
 from safetensors.torch import load_file, save_file
 from scipy.spatial import cKDTree
 
@@ -87,6 +88,19 @@ def test_matches_survive_turns_and_light(picture: NDArray[np.uint8], turn_deg: f
 def test_upright_features_are_not_turned(picture: NDArray[np.uint8]) -> None:
     assert not extract(picture, orientation="upright").view_orientation_deg.any()
     assert extract(picture).view_orientation_deg.std() > 30.0
+
+
+def test_angles_of_gradients_are_those_of_sift(picture: NDArray[np.uint8]) -> None:
+    """A point may have several. The picture turned by 60 degrees matches itself."""
+    found = extract(picture, detector="sift", orientation="gradient")
+    assert len(found.descriptors) > len(found.keypoints_px) > 100
+    assert found.view_orientation_deg.std() > 30.0
+    matrix = cv2.getRotationMatrix2D(((SIDE - 1) / 2, (SIDE - 1) / 2), 60.0, 1.0)
+    turned = cv2.warpAffine(picture, matrix, (SIDE, SIDE), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
+    _, share = share_right(found, extract(turned, detector="sift", orientation="gradient"), matrix)
+    assert share > 0.9
+    with pytest.raises(ValidationError, match="orientation=gradient needs detector=sift"):
+        Learned(orientation="gradient")
 
 
 def test_where_north_is_up_nothing_is_turned_unless_asked(picture: NDArray[np.uint8]) -> None:

@@ -25,7 +25,7 @@ from benchmarks.stamps import REPOSITORY
 @dataclass(frozen=True)
 class Standing:
     """A page of docs/results. minutes: planned, on two idle cores. runs: the text of commands after `scripts/bench`, in
-    which DATA and WEIGHTS stand for folders."""
+    which DATA, ANCHORS and WEIGHTS stand for folders."""
 
     page: str
     minutes: int
@@ -38,7 +38,11 @@ STANDING: Mapping[str, Standing] = {
     "peers": Standing(
         "peers.md",
         15,
-        ("peers rendered --reference-weights WEIGHTS", "peers real --data DATA --reference-weights WEIGHTS"),
+        (
+            "peers rendered --reference-weights WEIGHTS",
+            "peers real --data DATA --reference-weights WEIGHTS",
+            "anchors --data ANCHORS --reference-weights WEIGHTS",
+        ),
     ),
     "calibration": Standing("calibration.md", 7, ("calibration",)),
     "orientation": Standing("orientation.md", 12, ("orientation real --data DATA", "orientation rendered")),
@@ -61,6 +65,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = options.make_parser("results", __doc__)
     add = parser.add_argument
     add("--data", type=Path, metavar="DIR", help="folder of real blocks, BLOCK/images and BLOCK/reference")
+    add("--anchors", type=Path, metavar="DIR", help="homography pairs of danini/magsac; else without")
     add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks; else without")
     add("--only", type=options.names, default=",".join(STANDING), help="comma-separated")
     add("--docs", action="store_true", help="write the tables into docs/results and their figures into the README")
@@ -74,18 +79,22 @@ def main(arguments: Sequence[str]) -> int:
         parser.error("--docs and --quick: small runs make figures without worth, which do not belong into docs/results")
     if not args.list:
         _check_folders(parser, args)
-    for folder in (args.data, args.reference_weights):
+    for folder in (args.data, args.anchors, args.reference_weights):
         if folder is not None and not folder.is_dir():
             parser.error(f"{folder} is no folder")
     state = code_digest("")[:8] + ("-quick" if args.quick else "")
     given = {"DATA": _text(args.data), "OUT": _text(args.out and args.out / state)}
-    if args.reference_weights or args.list:
-        given["WEIGHTS"] = _text(args.reference_weights)
+    for word, folder in (("WEIGHTS", args.reference_weights), ("ANCHORS", args.anchors)):
+        if folder or args.list:
+            given[word] = _text(folder)
     failed = []
     for name in args.only:
         standing, started = STANDING[name], time.monotonic()
         print(f"# {name}" + ("" if args.quick else f": about {standing.minutes} minutes"), flush=True)
         for run in standing.runs:
+            if "ANCHORS" in shlex.split(run) and "ANCHORS" not in given:
+                print(f"left out: {run} (--anchors DIR)", flush=True)
+                continue
             asked = words(run, given, docs=args.docs, quick=args.quick)
             print(shlex.join(["scripts/bench", *asked]), flush=True)
             if not args.list and _run(asked):

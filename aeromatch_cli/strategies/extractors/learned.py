@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
@@ -50,10 +50,11 @@ class Learned(Described):
         "network",
         description="Keypoints from the maxima of the detector network's heat maps of several scales, or from SIFT.",
     )
-    orientation: Literal["auto", "network", "upright"] = Field(
+    orientation: Literal["auto", "network", "gradient", "upright"] = Field(
         "auto",
-        description="Rotate patches by the orientation network (network), or not at all (upright). auto: upright in "
-        "views that have north up.",
+        description="Rotate patches by the orientation network (network), by the gradients around SIFT's keypoints "
+        "(gradient; needs detector=sift), or not at all (upright). auto: by the network, upright in views that have "
+        "north up.",
     )
     context: bool = Field(
         False,
@@ -71,6 +72,12 @@ class Learned(Described):
         "depend on it: set it explicitly for shards on different processors.",
     )
     device: Device = DEVICE
+
+    @model_validator(mode="after")
+    def _check_orientation(self) -> Learned:
+        if self.orientation == "gradient" and self.detector != "sift":
+            raise ValueError("orientation=gradient needs detector=sift: only SIFT's keypoints have angles of their own")
+        return self
 
     @property
     def north_up_only(self) -> bool:
@@ -119,7 +126,7 @@ class Learned(Described):
             "context": self.context,
             "detector": self.detector == "network",
             "geodesc": True,
-            "orientation": self.orientation != "upright",
+            "orientation": self.orientation in ("auto", "network"),
         }
         return [name for name, asked in needed.items() if asked]
 
@@ -147,9 +154,10 @@ class Learned(Described):
         return loaders[name](path, precision=self.precision, device=device)
 
     def detected(self, view: ViewPixels, view_idx: int) -> Raw:
-        """One feature for each point, not yet turned."""
+        """One feature for each point, not yet turned; with `gradient` one for each of its orientations."""
         if self.detector == "sift":
-            return detect(sift_detector(), view, view_idx).upright()
+            raw = detect(sift_detector(), view, view_idx)
+            return raw if self.orientation == "gradient" else raw.upright()
         most = _CHOICE * self.keypoints
         points, sizes, confidences = heat_keypoints(view.gray, most, view.valid, self._network("detector"))
         return Raw(
@@ -173,6 +181,8 @@ class Learned(Described):
 
     def turned(self, raw: Raw, views: Sequence[ViewPixels]) -> Raw:
         """Orientations by the network, where a view needs them."""
+        if self.orientation == "gradient":
+            return raw
         from aeromatch_cli.nets.orientation import directions
 
         angles = raw.orientations_deg.copy()

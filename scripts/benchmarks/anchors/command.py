@@ -29,7 +29,8 @@ from aeromatch_cli.errors import InputError
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from benchmarks import options, stamps
-from benchmarks.anchors.layouts import LAYOUTS, Anchor, anchors_in, moved
+from benchmarks.anchors.judge import error_px
+from benchmarks.anchors.layouts import LAYOUTS, Anchor, anchors_in
 from benchmarks.peers.base import Options, Scene
 from benchmarks.peers.command import with_weights
 from benchmarks.peers.table import FROM_PICTURES, Named, check_method, method, named_methods, settings_of
@@ -38,12 +39,12 @@ from benchmarks.sources import OUR_CODE, PEER_CODE, code_digest, library_version
 from benchmarks.tables import Column, Row, code, grouped, interval, means, median, number, plain, ranged, table, values
 
 SOLVED_PX = (5.0, 10.0)
-_PLANE_PX, _LINES_PX, _CONFIDENCE, _ITERATIONS = 3.0, 1.0, 0.9999, 10_000
-_FEWEST = 8
+_OWN_CODE = ("benchmarks/anchors/layouts.py", "benchmarks/anchors/judge.py")
 _THREADS = 1
 METHODS = (
-    "oblique,oblique+lightglue=oblique[match=lightglue-learned],own on SIFT=oblique[extract.detector=sift],baseline,"
-    "SIFT=opencv-sift,aliked,aliked+lightglue,aliked-rot+lightglue,disk+lightglue,xfeat+lighterglue"
+    "oblique,oblique+lightglue=oblique[match=lightglue-learned],"
+    "own on SIFT=oblique[extract.detector=sift,extract.orientation=gradient],"
+    "baseline,SIFT=opencv-sift,aliked,aliked+lightglue,aliked-rot+lightglue,disk+lightglue,xfeat+lighterglue"
 )
 
 
@@ -64,7 +65,7 @@ def rows_of(args: argparse.Namespace, methods: Sequence[Named]) -> Iterator[Row]
         ours = name.spec not in FROM_PICTURES
         settings = load(*parse_method(name.spec)).model_dump(mode="json") if ours else None
         basis = [name.spec, settings, args.size, args.keypoints, args.seed, library_versions()]
-        basis += [code_digest(*(OUR_CODE if ours else PEER_CODE), "benchmarks/anchors")]
+        basis += [code_digest(*(OUR_CODE if ours else PEER_CODE), *_OWN_CODE)]
         path = args.out / f"{fingerprint(basis, [anchor.name for anchor in anchors])[:16]}.json"
         if not path.is_file():
             write_json(path, {"rows": list(_by_method(args, scene, anchors, shown, name.spec))})
@@ -86,34 +87,6 @@ def _by_method(
             "pair": anchor.name, "matches": len(points0), "explained": explained, "error_px": plain(error),
             "seconds": plain(seconds),
         }  # fmt: skip
-
-
-def error_px(
-    points0: FloatArray, points1: FloatArray, places0: FloatArray, places1: FloatArray, *, planar: bool
-) -> tuple[float, int]:
-    """Mean distance of places (N, 2) from where a model of the matches (M, 2) puts them, infinite without a model, and
-    the number of matches that it explains."""
-    import cv2
-
-    if len(points0) < _FEWEST:
-        return float("inf"), 0
-    robust = (cv2.USAC_MAGSAC, _PLANE_PX if planar else _LINES_PX)
-    try:
-        if planar:
-            model, mask = cv2.findHomography(points0, points1, *robust, maxIters=_ITERATIONS, confidence=_CONFIDENCE)
-        else:
-            model, mask = cv2.findFundamentalMat(points0, points1, *robust, _CONFIDENCE, _ITERATIONS)
-    except cv2.error:  # OpenCV asserts where no sample gives a model
-        return float("inf"), 0
-    if model is None or model.shape != (3, 3):
-        return float("inf"), 0
-    if planar:
-        off = np.linalg.norm(moved(model, places0) - places1, axis=1)
-    else:
-        lines = np.column_stack([places0, np.ones(len(places0))]) @ model.T
-        there = np.column_stack([places1, np.ones(len(places1))])
-        off = np.abs((lines * there).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1)
-    return float(np.mean(off)) if np.isfinite(off).all() else float("inf"), int(mask.sum())
 
 
 def _named(anchor: Anchor) -> tuple[str, str]:
@@ -179,7 +152,7 @@ def main(arguments: Sequence[str]) -> None:
     add("--seed", type=int, default=0, help="of the presets' samples")
     add("--reference-weights", type=Path, metavar="DIR", help="weights of peers that are networks")
     options.add_output(parser)
-    args = options.parse(parser, arguments)
+    args = options.parse(parser, arguments, {"methods": "opencv-sift,baseline", "size": 400, "keypoints": 500})
     asked = named_methods(args.methods)
     for name in asked:
         check_method(name.spec, FROM_PICTURES)
