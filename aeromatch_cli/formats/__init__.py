@@ -284,9 +284,9 @@ line per pair), `conditions.csv`, plots as PNG.
 
 `database.db` and `sparse/{cameras,images,points3D}.txt` in COLMAP's own formats and pixel frame (this workspace's plus
 0.5). `sparse/` holds the adjusted block: cameras, oriented images with their keypoints, and triangulated points with
-their tracks; without orientation the given poses alone. The pose priors of the database are the given positions.
-`orientation.csv`, `residuals.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here
-plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
+their tracks; without adjustment the poses of the orientation, or those given, alone. The pose priors of the database
+are the given positions. `orientation.csv`, `residuals.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in
+the CRS is the one here plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
 
 Groups of images whose place beside each other is not known are models of their own. `sparse/` holds what positions have
 placed in the world, else the largest group; `sparse_own2/` is the model of the images with the frame `own 2` in

@@ -22,7 +22,7 @@ from aeromatch_cli.results.adjustment import Control, GroupResult
 from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.sfm.block_figures import block_figures, residual_figures, residuals_of
 from aeromatch_cli.sfm.calibration import held_by
-from aeromatch_cli.sfm.mapping import Group, adjust_block
+from aeromatch_cli.sfm.mapping import Group, adjust_block, own_frames
 from aeromatch_cli.sfm.mapping_process import LARGE_BLOCK
 from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES
 from aeromatch_cli.stages import orient
@@ -90,7 +90,7 @@ def _with_more_images(context: Context, groups: Sequence[Group]) -> tuple[Contex
     images = set() if found is None else _images(found.groups)
     if found is None or len(images) <= len(oriented):
         return context, groups, []
-    block = replace(context.block, cameras=found.cameras, poses=found.poses)
+    block = replace(context.block, cameras=found.cameras, poses=found.poses, frames=own_frames(found.groups))
     words = f"oriented from the verified matches: {len(images)} images, {len(oriented)} from the first pass"
     names = {image.image_id: image.name for image in context.block.images}
     return replace(context, block=block), found.groups, [words, *single_pair_words(found.result, names)]

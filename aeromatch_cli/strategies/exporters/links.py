@@ -32,7 +32,8 @@ class Links:
 
     @classmethod
     def of(cls, contents: ExportContents, solution: Solution, found: Matched) -> Links:
-        beside = unplaced(contents)
+        # Images that lay in frames of their own have a place in the world only where the adjustment gave them one.
+        beside = unplaced(contents) | (contents.block.frames.keys() if contents.block.metric else set())
         # In frames of their own it is not known of images without adjusted pose to which group they belong.
         known = {} if beside and not contents.block.metric else contents.block.poses
         positions = {i: pose.center_m for i, pose in known.items() if i not in beside}
