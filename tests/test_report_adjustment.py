@@ -18,7 +18,7 @@ from aeromatch_cli.report.adjustment import (
     as_adjusted,
     images_aside,
 )
-from aeromatch_cli.results.stages import AdjustResult, OrientResult
+from aeromatch_cli.results.stages import AdjustResult, OrientResult, PairsResult
 from aeromatch_cli.sfm.block_figures import block_figures
 from aeromatch_cli.stages.stage_report import StageReport
 
@@ -56,6 +56,16 @@ def test_a_frame_of_its_own_has_no_metres(full):  # noqa: F811
     page = page_of(full)
     assert "x, arbitrary units" in page
     assert "metres" not in page.split('id="settings"')[0].replace("no metre", "")
+
+
+def test_pixels_on_the_ground_are_those_of_the_summary(full):  # noqa: F811
+    """Views have one common size for all images, those in frames of their own among them."""
+    first = StageReport("pairs", items=5, done=5)
+    first.result = filled(PairsResult, images=4, block={"metric": True, "gsd_m": 0.0484})
+    first.write(full.workspace)
+    views = replace(full, block=replace(full.block, gsd_m=0.0515))
+    assert "0.0484 m" in page_of(views)
+    assert "0.0515 m" not in page_of(views)
 
 
 def test_the_page_shows_the_block_as_it_was_adjusted():

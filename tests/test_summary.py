@@ -11,8 +11,7 @@ from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_yaw_pitch_roll
-from aeromatch_cli.sfm.mapping import Group
-from aeromatch_cli.stages.pairs import _apart
+from aeromatch_cli.sfm.mapping import Group, own_frames
 
 CAMERA = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 ORIGIN = (333000.0, 3100000.0, 0.0)  # EPSG:32617
@@ -170,15 +169,31 @@ def test_missing_attitude_is_stated() -> None:
 
 def test_images_are_apart_that_nothing_ties_to_the_world_or_to_the_largest_group() -> None:
     large, small, placed = Group("level", ("a", "b", "c")), Group("level", ("d", "e")), Group("positions", ("f",))
-    assert _apart([large, small]) == {"d", "e"}
-    assert _apart([placed, large, small]) == {"a", "b", "c", "d", "e"}
-    assert _apart([large]) == _apart([placed]) == _apart([]) == set()
+
+    def apart(*groups: Group) -> frozenset[str]:
+        poses = {i: Pose(np.zeros(3), np.eye(3), 1.0, 1.0) for group in groups for i in group.images}
+        return replace(block(), poses=poses, frames=own_frames(groups)).aside(in_world=False)
+
+    assert apart(large, small) == {"d", "e"}
+    assert apart(placed, large, small) == {"a", "b", "c", "d", "e"}
+    assert apart(large) == apart(placed) == apart() == set()
+    assert own_frames([placed, large, small]) == dict.fromkeys("abc", 1) | dict.fromkeys("de", 2)
 
 
-def test_the_extent_is_of_images_whose_places_to_each_other_are_known() -> None:
+def test_lengths_are_of_images_whose_places_to_each_other_are_known() -> None:
+    """Two images lie 1000 units aside and as high, in a frame of their own, and are tilted there."""
     found = block()
     assert "extent           100.0 m east-west, 25.0 m north-south" in summarise(found).lines()
-    far = {"img4", "img5"}
-    moved = {i: replace(p, center_m=p.center_m + 1000.0 * (i in far)) for i, p in found.poses.items()}
-    lines = summarise(replace(found, poses=moved), apart=far).lines()
-    assert "extent           60.0 m east-west, 15.0 m north-south, of 4 images that hang together" in lines
+    far = {"img4": 1, "img5": 1}
+    tilted = from_omega_phi_kappa(40.0, 0.0, 0.0)
+    moved = {
+        i: replace(p, center_m=p.center_m + 1000.0, world_rotation=tilted) if i in far else p
+        for i, p in found.poses.items()
+    }
+    summary = summarise(replace(found, poses=moved, frames=far))
+    alone = summarise(replace(found, images=found.images[:4]))
+    (words,) = (line for line in summary.lines() if line.startswith("extent"))
+    assert "60.0 m east-west, 15.0 m north-south, of 4 images that hang together; height, tilt and ground" in words
+    assert (summary.positioned, summary.oriented, summary.together) == (6, 6, 4)
+    assert summary.flying_height_m == pytest.approx(alone.flying_height_m)
+    assert (summary.gsd_m, summary.max_tilt_deg) == (pytest.approx(alone.gsd_m), pytest.approx(alone.max_tilt_deg))

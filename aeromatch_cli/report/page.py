@@ -123,6 +123,8 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
     oriented = result_on_file(context.workspace, OrientResult)
     wrong = {} if oriented is None else oriented.wrong_attitudes
     block = result_on_file(context.workspace, PairsResult)
+    # Not that of the views, which is of images in frames of their own, too.
+    gsd_m = None if block is None else block.block.gsd_m
     matched = result_on_file(context.workspace, MatchResult)
     control = adjustment.found.control
     failures = failure_rows(context)
@@ -158,7 +160,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
             adjusted,
             read_position_residuals(context, adjustment),
             {row.image_id: row.name for row in images},
-            context.block.gsd_m,
+            gsd_m,
             adjustment.found.groups,
         ),
         cameras=_cameras(context, adjustment, adjusted),
@@ -166,7 +168,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
         heights=heights_section(adjustment.found),
         residuals=surveyed_rows(control),
         residuals_after_fit=control is not None and control.transformation is not None,
-        block=_block_facts(context, in_world=adjustment.in_world),
+        block=_block_facts(context, gsd_m, in_world=adjustment.in_world),
         map=_map(placed, images, pairs, wrong, pictures, aside, in_world=adjustment.in_world),
         fields=_ground_figures(placed, adjusted, in_world=adjustment.in_world),
         histograms=[*_histograms(images, pairs), *point_figures(adjusted)],
@@ -341,9 +343,9 @@ def notices(
     return found
 
 
-def _block_facts(context: Context, *, in_world: bool) -> list[tuple[str, str]]:
+def _block_facts(context: Context, gsd_m: float | None, *, in_world: bool) -> list[tuple[str, str]]:
+    """gsd_m: ground sampling distance in metres, None where it is not known."""
     block = context.block
-    gsd_m = block.gsd_m if in_world else None
     frame = f"{block.crs}, minus the origin {' / '.join(f'{value:,.0f}' for value in block.origin_m)}"
     return [
         ("World frame", frame if in_world else "the pictures' own: scale, north and place are arbitrary"),
