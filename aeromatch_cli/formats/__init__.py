@@ -32,7 +32,9 @@ the reduced ones. `aeromatch run WORK` follows them and makes the rest.
 - `metric`: whether lengths are metres; false in a frame of the pictures' own, whose scale is arbitrary: there every
   length of the workspace, whatever its name, counts in units of that frame.
 - `ground_source`: where the ground height comes from, in words. `ground_z_m`: world height, null with a DEM or none.
-- `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
+- `frames`: image_id -> number of the frame of its own that its group lies in before the adjustment. `poses.csv` puts
+  it aside of the others, where scale, north and place are arbitrary. Images that are not listed lie in the world.
+- `gsd_m`: common ground sampling distance of the views of all images, metres per pixel; null without attitudes.
 - `ground_fingerprint`: of the setting that the ground comes from.
 
 ### index.sqlite
