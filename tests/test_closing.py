@@ -72,6 +72,14 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
             ["bad: no image is oriented", "known positions and attitudes (--poses)"],
         ),
         (
+            {"adjust": {"images": 0, "remarks": ["not done: killed"], "stopped": "killed"}},
+            ["bad: no image is adjusted: killed; the same command tries again"],
+        ),
+        (
+            {"adjust": {"images": 0, "remarks": ["not done"]}, "orient": {"stopped": "the mapper was ended"}},
+            ["bad: no image is adjusted: the mapper was ended"],
+        ),
+        (
             {"consistency": {"components": [3, 1], "weakly_tied": ["d"]}},  # of the final matches
             ["bad: 2 groups of images (3, 1)", "weak: d.jpg, with fewer than 50 verified matches"],
         ),

@@ -58,7 +58,7 @@ def run(context: Context) -> StageReport:
     _remove(context)
     context, groups, words = _with_more_images(context, groups)
     if not groups:
-        report.result = AdjustResult(images=0, remarks=[_NOTHING])
+        report.result = AdjustResult(images=0, remarks=[_NOTHING], outside=_none_adjusted(context, without_results))
         return report.write(context.workspace)
     try:
         with context.executor.step("adjust"):
@@ -66,7 +66,9 @@ def run(context: Context) -> StageReport:
             adjusted, found = adjust_block(contents, context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
-        report.result = AdjustResult(images=0, remarks=[f"not done: {error}"])  # not that of an earlier adjustment
+        stopped, outside = str(error), _none_adjusted(context, without_results, str(error))
+        # Not that of an earlier adjustment.
+        report.result = AdjustResult(images=0, remarks=[f"not done: {stopped}"], stopped=stopped, outside=outside)
         return report.write(context.workspace)
     residuals = _residuals(context, adjusted)
     result = _result(context, adjusted, found, residuals, without_results)
@@ -74,6 +76,13 @@ def run(context: Context) -> StageReport:
     report.done = report.items
     report.record_files(context, _write(context, adjusted, residuals))
     return report.write(context.workspace)
+
+
+def _none_adjusted(context: Context, without_results: Sequence[Pair], stopped: str = "") -> dict[str, str]:
+    """Return why no image is adjusted, by image_id; nothing of two images, which have no adjustment."""
+    if len(context.block.images) < FEWEST_IMAGES:
+        return {}
+    return unregistered_reasons(context, AdjustedBlock.empty(), without_results, stopped)
 
 
 def _with_more_images(context: Context, groups: Sequence[Group]) -> tuple[Context, Sequence[Group], list[str]]:
