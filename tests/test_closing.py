@@ -81,7 +81,19 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
         ),
         (
             {"consistency": {"components": [3, 1], "weakly_tied": ["d"]}},  # of the final matches
-            ["bad: 2 groups of images (3, 1)", "weak: d.jpg, with fewer than 50 verified matches"],
+            [
+                "bad: 2 groups of images (3, 1) that no verified pair connects, one before the stage consistency dropped "
+                "matches: more overlap",
+                "weak: d.jpg, with fewer than 50 verified matches",
+            ],
+        ),
+        (
+            {"filter": {"components": [3, 1]}, "consistency": {"components": [2, 1, 1]}},
+            ["bad: 3 groups of images (2, 1, 1) that no verified pair connects, 2 before the stage consistency"],
+        ),
+        (
+            {"filter": {"components": [3, 1]}, "consistency": {"components": [3, 1]}},
+            ["bad: 2 groups of images (3, 1) that no verified pair connects: more overlap between them helps"],
         ),
         ({"filter": {"weakly_tied": ["c"]}}, ["good: all 4", "weak: c.jpg, with fewer than 50 verified matches"]),
         ({"spread": {"d": [9, 0, 3]}}, ["good", "weak: d.jpg, with fewer than 20 points that three images see"]),

@@ -56,8 +56,8 @@ def unregistered_reasons(
         elif not verified[image_id]:
             reasons[image_id] = f"none of its {pairs[image_id]} pairs could be verified"
         elif not adjusted.poses:
-            why = stopped or "no image could be oriented"
-            reasons[image_id] = f"{why} ({verified[image_id]} verified pairs of this one)"
+            some = f"no image could be oriented ({verified[image_id]} verified pairs of this one)"
+            reasons[image_id] = stopped or some
         elif not tied[image_id]:
             reasons[image_id] = f"its {verified[image_id]} verified pairs are with images that are not oriented either"
         else:

@@ -43,6 +43,9 @@ def connection(evidence: QualityInput) -> Iterator[Finding]:
         return
     shown = ", ".join(map(str, sizes[:5])) + (", ..." if len(sizes) > 5 else "")
     words = f"{len(sizes)} groups of images ({shown}) that no verified pair connects"
+    if 0 < evidence.components_before < len(sizes):
+        before = "one" if evidence.components_before == 1 else f"{evidence.components_before}"
+        words += f", {before} before the stage consistency dropped matches"
     hidden = "; --set pairs=exhaustive finds pairs that positions hide" if evidence.hidden_pairs else ""
     yield finding_of("connection", beside, _LEFT_OUT, words, f"more overlap between them helps{hidden}")
 
