@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from make_results import filled
 
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_yaw_pitch_roll
+from aeromatch_cli.results.stages import OrientResult
 from aeromatch_cli.sfm.mapping import Group, own_frames
+from aeromatch_cli.stages.messages import frame_remarks
 
 CAMERA = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 ORIGIN = (333000.0, 3100000.0, 0.0)  # EPSG:32617
@@ -165,6 +168,29 @@ def test_missing_attitude_is_stated() -> None:
     given = summarise(block(rotations=[*TILTED]))
     words = "without attitude 2: those given contradict the pictures and are not used; paired by position"
     assert words in summary.lines(given)
+
+
+def test_given_positions_that_a_frame_of_its_own_does_not_hold_are_said_to_be_given() -> None:
+    """Two images with positions are not oriented, four without are, in a frame of their own."""
+    whole = block()
+    given = summarise(replace(whole, poses={i: whole.poses[i] for i in ("img0", "img1")}))
+    oriented = {f"img{k}": whole.poses[f"img{k}"] for k in range(2, 6)}
+    own = summarise(replace(whole, poses=oriented, crs="local", metric=False, frames=dict.fromkeys(oriented, 1)))
+    assert "images           6, 2 with position, 2 with attitude, 1 camera" in given.given_lines()
+    lines = own.lines(given)
+    assert "outside frame    2: paired by name and time; the 2 given positions are not in it" in lines
+    assert not any("without position" in line for line in lines)
+    assert "outside frame    2: paired by name and time" in own.lines()
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [(0, "positions the result"), (2, "positions (2 given, none places a group of oriented images) the result")],
+)
+def test_a_frame_of_its_own_is_explained_by_the_positions_that_are_given(given: int, why: str) -> None:
+    found = filled(OrientResult, frame="own", positions_given=given)
+    (remark,) = frame_remarks(found, [Group("level", ("a", "b", "c"))])
+    assert remark == f"without usable {why} is in a frame of its own: scale, north and place are arbitrary"
 
 
 def test_images_are_apart_that_nothing_ties_to_the_world_or_to_the_largest_group() -> None:

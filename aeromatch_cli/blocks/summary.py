@@ -80,7 +80,7 @@ class BlockSummary:
             spacing = f"{100.0 * self.gsd_m:.2f} cm" if self.metric else length(self.gsd_m, 4)
             found.append(f"ground sampling  {spacing} per pixel")
         if self.positioned < self.images:
-            found.append(f"without position {self.images - self.positioned}: paired by name and time")
+            found.append(self._unplaced_line(0 if given is None else given.positioned))
         if self.oriented < self.positioned:
             refuted = given is not None and given.oriented > self.oriented
             why = "those given contradict the pictures and are not used; " if refuted else ""
@@ -95,6 +95,14 @@ class BlockSummary:
         if np.isfinite(self.best_overlap):
             found.append(f"overlap          {100.0 * self.best_overlap:.0f} % with the best neighbour, on average")
         return found
+
+    def _unplaced_line(self, given: int) -> str:
+        """Say how many images have no position, or none in a frame of the pictures' own. given: positions given."""
+        count, paired = self.images - self.positioned, "paired by name and time"
+        if self.metric:
+            return f"without position {count}: {paired}"
+        lie = "given position is not in it" if given == 1 else f"{given} given positions are not in it"
+        return f"outside frame    {count}: {paired}" + (f"; the {lie}" if given else "")
 
     def figures(self) -> dict[str, Any]:
         """Every field, JSON-ready: pairs_by_reason as a mapping, None for what is unknown, and for lengths that are no
