@@ -174,6 +174,24 @@ def test_colmap_has_a_model_for_each_frame_also_without_adjustment(
     assert f"sparse (4 images), {second} (2 images)" in summary.remarks[0]
 
 
+@pytest.mark.parametrize("adjusted", [True, False])
+def test_a_model_in_a_frame_of_its_own_alone_is_not_in_the_crs(
+    placed: ExportContents, adjusted: bool, tmp_path: Path
+) -> None:
+    """As where the adjustment keeps nothing of what positions have placed."""
+    assert placed.adjusted is not None
+    _, loose = placed.adjusted.parts()
+    alone = replace(placed, adjusted=loose)
+    Colmap()(alone if adjusted else before(alone), tmp_path / "colmap")
+    (frame,) = json.loads((tmp_path / "colmap" / "world.json").read_text())["frames"]
+    assert frame == {"model": "sparse", "frame": "own 1", "unit": "arbitrary", "images": names(SMALL)}
+    found = read_pose_file(tmp_path / "colmap" / "sparse")
+    assert found.crs is None
+    np.testing.assert_allclose(found.rows[0].position, loose.poses["img4"].center_m, atol=1e-6)
+    summary = EXPORTERS["bundler"]()(alone if adjusted else before(alone), tmp_path / "bundler")  # type: ignore[operator]
+    assert summary.posed_images == 0
+
+
 def test_a_block_that_has_become_one_leaves_no_second_model(own: ExportContents, truth: Truth, tmp_path: Path) -> None:
     folder = tmp_path / "colmap"
     Colmap()(own, folder)
@@ -247,6 +265,18 @@ def test_an_image_of_an_own_frame_that_was_not_adjusted_has_no_place_in_the_worl
     assert [one["properties"]["image"] for one in features] == names(LARGE)
     rows = orientation_text(first, oriented.block).splitlines()[1:]
     assert [row.split(",")[0] for row in rows] == names(LARGE)
+
+
+def test_an_image_that_the_adjustment_brings_into_the_world_has_no_footprint_of_its_own_frame(
+    placed: ExportContents, truth: Truth, tmp_path: Path
+) -> None:
+    tied = replace(before(placed), adjusted=adjusted_block(truth))
+    EXPORTERS["geojson"]()(tied, tmp_path / "geojson")  # type: ignore[operator]
+    shown = {
+        name: [one["properties"]["image"] for one in json.loads((tmp_path / "geojson" / name).read_text())["features"]]
+        for name in ("cameras.geojson", "footprints.geojson")
+    }
+    assert shown == {"cameras.geojson": names((*LARGE, *SMALL)), "footprints.geojson": names(LARGE)}
 
 
 def test_maps_show_images_without_adjusted_pose_only_where_their_frame_is_known(

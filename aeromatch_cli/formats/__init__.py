@@ -294,7 +294,7 @@ Groups of images whose place beside each other is not known are models of their 
 placed in the world, else the largest group; `sparse_own2/` is the model of the images with the frame `own 2` in
 `orientation.csv`, with a `world.json` of its own, since it lies in no CRS. Numbers of images and cameras are those of
 the database in all models; points are numbered model by model. `frames` of the upper `world.json` lists them: `model`
-(folder), `frame` (as in `orientation.csv`), `unit`, `images` (names). Where there is one frame, it is absent.
+(folder), `frame` (as in `orientation.csv`), `unit`, `images` (names). It is absent where all lie in the block's frame.
 """
 
 

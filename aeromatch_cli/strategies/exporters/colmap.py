@@ -297,16 +297,18 @@ def _models_remark(models: Mapping[str, Model]) -> list[str]:
 
 
 def _write_worlds(folder: Path, block: Block, models: Mapping[str, Model]) -> None:
-    """world.json, with the images of every frame where there are several, and in the folder of every further model."""
+    """world.json, with the images of every frame where there is another than the block's own, and one in the folder of
+    every model that lies in such."""
     names = {image.image_id: image.name for image in block.images}
     frames = []
-    for name, model in models.items() if len(models) > 1 else ():
+    elsewhere = [name for name, model in models.items() if name != _SPARSE or (block.metric and model.frame)]
+    for name, model in models.items() if elsewhere else ():
         frame = f"own {model.frame}" if model.frame else "world"
         unit = "m" if block.metric and not model.frame else "arbitrary"
         images = sorted(names[image_id] for image_id in model.poses)
         frames.append({"model": name, "frame": frame, "unit": unit, "images": images})
     write_world(folder, block, frames)
-    for name in models.keys() - {_SPARSE}:
+    for name in elsewhere:
         write_world(folder / name, replace(block, crs="local", origin_m=(0.0, 0.0, 0.0), metric=False))
 
 

@@ -73,11 +73,12 @@ def camera_fields(contents: ExportContents, solution: Solution, links: Links) ->
 def footprint_fields(
     contents: ExportContents, solution: Solution, links: Links
 ) -> list[tuple[Footprint, dict[str, Any]]]:
-    """Footprints and their attributes, by image_id, of images that have a place."""
+    """Footprints and their attributes, by image_id, of images that have a place: by poses before the adjustment, which
+    of images in frames of their own say nothing of the world."""
     images = {image.image_id: image for image in contents.block.images}
     found = []
     for image_id, footprint in sorted(block_footprints(contents.block).items()):
-        if image_id not in links.positions:
+        if image_id not in links.positions or (contents.block.metric and image_id in contents.block.frames):
             continue
         image = images[image_id]
         fields = {

@@ -53,8 +53,8 @@ def adjusted_poses(adjusted: AdjustedBlock) -> dict[str, tuple[FloatArray, Float
 
 def unplaced(contents: ExportContents) -> frozenset[str]:
     """Images of groups whose place beside the first part of the block is not known, as adjusted or, without adjustment,
-    as oriented; of a block with a CRS all that no position has placed in it."""
-    return (contents.adjusted or contents.block).aside(in_world=contents.geographic is not None)
+    as oriented; of a block in metres all that no position has placed in its world."""
+    return (contents.adjusted or contents.block).aside(in_world=contents.block.metric)
 
 
 def unplaced_remark(contents: ExportContents) -> list[str]:
