@@ -6,7 +6,7 @@ top-left pixel of the stored raster.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -110,18 +110,12 @@ class AdjustedBlock:
         positions have placed in the world, then groups in frames of their own, the largest first; itself where it is
         one. At least one part.
         """
-        members: dict[int, list[str]] = {}
-        for image_id in self.poses:
-            members.setdefault(self.frames.get(image_id, 0), []).append(image_id)
-        if len(members) < 2:
-            return [self]
-        return [self._part(members[k]) for k in sorted(members, key=lambda k: (k > 0, -len(members[k]), k))]
+        parts = by_frame(self.poses, self.frames)
+        return [self] if len(parts) < 2 else [self._part(part) for part in parts]
 
     def aside(self, *, in_world: bool) -> frozenset[str]:
         """Return the images whose place beside the first part is not known; `in_world` that in the world."""
-        first, *others = self.parts()
-        beside = frozenset(image_id for part in others for image_id in part.poses)
-        return beside.union(first.frames) if in_world else beside
+        return _aside(self.poses, self.frames, in_world=in_world)
 
     def _part(self, image_ids: Sequence[str]) -> AdjustedBlock:
         tracks = {i: self.tracks[i] for i in image_ids if i in self.tracks}
@@ -131,6 +125,21 @@ class AdjustedBlock:
         poses = {i: self.poses[i] for i in image_ids}
         frames = {i: self.frames[i] for i in image_ids if i in self.frames}
         return AdjustedBlock(self.cameras, poses, self.points_m[seen], self.errors_px[seen], tracks, frames)
+
+
+def by_frame(image_ids: Iterable[str], frames: Mapping[str, int]) -> list[list[str]]:
+    """Return images in parts that have a frame each: first those in the world, which `frames` lacks, then groups in
+    frames of their own, the largest first."""
+    members: dict[int, list[str]] = {}
+    for image_id in image_ids:
+        members.setdefault(frames.get(image_id, 0), []).append(image_id)
+    return [members[k] for k in sorted(members, key=lambda k: (k > 0, -len(members[k]), k))]
+
+
+def _aside(image_ids: Iterable[str], frames: Mapping[str, int], *, in_world: bool) -> frozenset[str]:
+    parts = by_frame(image_ids, frames)
+    beside = frozenset(image_id for part in parts[1:] for image_id in part)
+    return beside | {i for part in parts[:1] for i in part if i in frames} if in_world else beside
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +254,8 @@ class Block:
     where none is reduced. tied: pairs (image_id0, image_id1) that a first pass has matched; similar: pairs that look
     alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found.
     calibrated: camera_ids whose focal length the first pass has found. metric: whether lengths are metres; false in a
-    frame of the pictures' own, whose scale is arbitrary.
+    frame of the pictures' own, whose scale is arbitrary. frames: image_id -> number of the frame of its own that its
+    group lies in, from 1; absent where the image has its place in the world.
     """
 
     images: tuple[Image, ...]
@@ -262,6 +272,11 @@ class Block:
     calibrated: frozenset[str] = frozenset()
     reduced_gsd_m: float | None = None
     metric: bool = True
+    frames: Mapping[str, int] = field(default_factory=dict)
+
+    def aside(self, *, in_world: bool) -> frozenset[str]:
+        """Return the images whose place beside the first part is not known, as `AdjustedBlock.aside`."""
+        return _aside(self.poses, self.frames, in_world=in_world)
 
     @property
     def views_gsd_m(self) -> float | None:

@@ -24,6 +24,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Pose
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
+from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import normalise, project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, to_omega_phi_kappa
@@ -475,6 +476,13 @@ def test_matches_are_exported_where_the_adjustment_fails(done_site: Site, monkey
     assert outcome.code == 1
     assert done_site.failures() == [("adjust", "all images")]
     assert outcome.facts["stages"]["adjust"]["result"]["images"] == 0  # not those of the adjustment before
+    assert (
+        "no image is adjusted: pycolmap's bundle adjustment stopped with exit code -6: Check failed" in outcome.stdout
+    )
+    lost = read_csv(done_site.work / "lost.csv")
+    assert len(lost) == IMAGES
+    assert {row["what"] for row in lost} == {"not oriented"}
+    assert all(row["reason"].startswith("pycolmap's bundle adjustment stopped") for row in lost)
     export = done_site.work / "export" / "colmap"
     assert (export / "database.db").is_file()
     assert not (export / "orientation.csv").exists()

@@ -65,6 +65,32 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
         ),
         ({"adjust": {"groups": [LEVEL] * 3, "positions_given": 0}}, ["bad: 3 parts whose scale", "--poses"]),
         ({"adjust": {"groups": [LEVEL], "positions_given": 0}}, ["doubtful: shape only: nothing ties the block"]),
+        (
+            {"adjust": {"groups": [LEVEL], "positions_given": 2}},
+            [
+                "doubtful: shape only: nothing ties",
+                "the 2 given positions are not enough, those (--poses) of three images",
+            ],
+        ),
+        (
+            {"adjust": {"groups": [LEVEL]}, "orient": {"models": [{"contradiction": ""}]}},
+            ["bad: none of the 4 given positions is used: too few are of images that are oriented together"],
+        ),
+        (
+            {"adjust": {"groups": [LEVEL]}, "orient": {"models": [{"contradiction": "scattered"}]}},
+            ["bad: none of the 4 given positions is used, the pictures contradict them"],
+        ),
+        (
+            {"filter": {"components": [2, 2]}, "adjust": {"groups": [PLACED, {"kind": "level", "images": 2}]}},
+            ["bad: 2 groups", "1 part (2 images) has a frame of its own", "export=colmap writes a model of it"],
+        ),
+        (
+            {
+                "filter": {"components": [2, 1, 1]},
+                "adjust": {"groups": [{"kind": "level", "images": n} for n in (9, 3, 2)], "positions_given": 0},
+            },
+            ["bad: 3 groups", "2 parts (3, 2 images) have frames of their own", "export=colmap writes a model of each"],
+        ),
         ({"adjust": {"groups": [PLACED] * 2}}, ["doubtful: 2 parts (4, 4 images) share too few points"]),
         ({"adjust": {"images": 0}}, ["good: all 4 images are connected", "not checked: orientation: orient=none"]),
         (
@@ -72,8 +98,28 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
             ["bad: no image is oriented", "known positions and attitudes (--poses)"],
         ),
         (
+            {"adjust": {"images": 0, "remarks": ["not done: killed"], "stopped": "killed"}},
+            ["bad: no image is adjusted: killed; the same command tries again"],
+        ),
+        (
+            {"adjust": {"images": 0, "remarks": ["not done"]}, "orient": {"stopped": "the mapper was ended"}},
+            ["bad: no image is adjusted: the mapper was ended"],
+        ),
+        (
             {"consistency": {"components": [3, 1], "weakly_tied": ["d"]}},  # of the final matches
-            ["bad: 2 groups of images (3, 1)", "weak: d.jpg, with fewer than 50 verified matches"],
+            [
+                "bad: 2 groups of images (3, 1) that no verified pair connects, one before the stage consistency "
+                "dropped matches: more overlap",
+                "weak: d.jpg, with fewer than 50 verified matches",
+            ],
+        ),
+        (
+            {"filter": {"components": [3, 1]}, "consistency": {"components": [2, 1, 1]}},
+            ["bad: 3 groups of images (2, 1, 1) that no verified pair connects, 2 before the stage consistency"],
+        ),
+        (
+            {"filter": {"components": [3, 1]}, "consistency": {"components": [3, 1]}},
+            ["bad: 2 groups of images (3, 1) that no verified pair connects: more overlap between them helps"],
         ),
         ({"filter": {"weakly_tied": ["c"]}}, ["good: all 4", "weak: c.jpg, with fewer than 50 verified matches"]),
         ({"spread": {"d": [9, 0, 3]}}, ["good", "weak: d.jpg, with fewer than 20 points that three images see"]),

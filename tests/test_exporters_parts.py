@@ -16,7 +16,8 @@ from test_exporters_ply import read_ply
 
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.pose_files import read_pose_file
-from aeromatch_cli.data import AdjustedBlock, AdjustedPose
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Pose
+from aeromatch_cli.formats.adjusted import orientation_text
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.strategies.exporters import EXPORTERS, Colmap, ExportContents
 
@@ -63,6 +64,15 @@ def own(truth: Truth) -> ExportContents:
 def placed(truth: Truth) -> ExportContents:
     """With positions, which place the large group alone."""
     return replace(truth.contents(), adjusted=halves(truth, dict.fromkeys(SMALL, 1)), geographic=geographic)
+
+
+def before(contents: ExportContents) -> ExportContents:
+    """The same as it was oriented, without an adjustment: poses in the frames of the groups, no points."""
+    adjusted = contents.adjusted
+    assert adjusted is not None
+    poses = {i: Pose(pose.center_m, pose.rotation, 0.5, 0.2) for i, pose in adjusted.poses.items()}
+    block = replace(contents.block, poses=poses, frames=adjusted.frames)
+    return replace(contents, block=block, adjusted=None)
 
 
 def check_model(folder: Path, images: tuple[str, ...], adjusted: AdjustedBlock) -> None:
@@ -141,6 +151,47 @@ def test_colmap_has_the_world_in_its_first_model(placed: ExportContents, tmp_pat
         np.testing.assert_allclose(found.rows[0].position, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["own", "placed"])
+def test_colmap_has_a_model_for_each_frame_also_without_adjustment(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """As where the adjustment has failed: no frame is taken for another, and worlds are as of an adjusted block."""
+    import pycolmap
+
+    contents, folder = request.getfixturevalue(kind), tmp_path / "oriented"
+    summary = Colmap()(before(contents), folder)
+    Colmap()(contents, tmp_path / "adjusted")
+    second = {"own": "sparse_own2", "placed": "sparse_own1"}[kind]
+    for model, images in (("sparse", LARGE), (second, SMALL)):
+        found = pycolmap.Reconstruction(folder / model)
+        assert (sorted(image.name for image in found.images.values()), found.num_points3D()) == (names(images), 0)
+        for image in found.images.values():
+            center_m = contents.adjusted.poses[f"img{image.image_id - 1}"].center_m
+            np.testing.assert_allclose(image.projection_center(), center_m, atol=1e-9)
+    for path in ("world.json", f"{second}/world.json"):
+        assert (folder / path).read_text() == (tmp_path / "adjusted" / path).read_text()
+    assert (summary.posed_images, len(summary.remarks)) == (6, 1)
+    assert f"sparse (4 images), {second} (2 images)" in summary.remarks[0]
+
+
+@pytest.mark.parametrize("adjusted", [True, False])
+def test_a_model_in_a_frame_of_its_own_alone_is_not_in_the_crs(
+    placed: ExportContents, adjusted: bool, tmp_path: Path
+) -> None:
+    """As where the adjustment keeps nothing of what positions have placed."""
+    assert placed.adjusted is not None
+    _, loose = placed.adjusted.parts()
+    alone = replace(placed, adjusted=loose)
+    Colmap()(alone if adjusted else before(alone), tmp_path / "colmap")
+    (frame,) = json.loads((tmp_path / "colmap" / "world.json").read_text())["frames"]
+    assert frame == {"model": "sparse", "frame": "own 1", "unit": "arbitrary", "images": names(SMALL)}
+    found = read_pose_file(tmp_path / "colmap" / "sparse")
+    assert found.crs is None
+    np.testing.assert_allclose(found.rows[0].position, loose.poses["img4"].center_m, atol=1e-6)
+    summary = EXPORTERS["bundler"]()(alone if adjusted else before(alone), tmp_path / "bundler")  # type: ignore[operator]
+    assert summary.posed_images == 0
+
+
 def test_a_block_that_has_become_one_leaves_no_second_model(own: ExportContents, truth: Truth, tmp_path: Path) -> None:
     folder = tmp_path / "colmap"
     Colmap()(own, folder)
@@ -185,6 +236,47 @@ def test_formats_of_one_frame_say_what_they_leave_out(
     posed, points = FOUND[name](tmp_path / name)
     assert posed is None or posed == names(LARGE)
     assert points in (None, len(contents.adjusted.parts()[0].points_m))
+
+
+@pytest.mark.parametrize("name", [*OTHERS, "opensfm"])
+@pytest.mark.parametrize("kind", ["own", "placed"])
+def test_formats_of_one_frame_say_what_they_leave_out_also_without_adjustment(
+    name: str, kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    contents = before(request.getfixturevalue(kind))
+    summary = EXPORTERS[name]()(contents, tmp_path / name)  # type: ignore[operator]
+    assert (summary.images, summary.posed_images) == (6, 4)
+    assert "2 images of another group, whose place beside the first is not known" in summary.remarks[-1]
+    if name == "opensfm":
+        assert not (tmp_path / name / "reconstruction.json").exists()
+    elif name != "ply":
+        # Tracks are told with their points, of which there are none.
+        assert FOUND[name](tmp_path / name)[0] == ([] if name == "tracks" else names(LARGE))
+
+
+def test_an_image_of_an_own_frame_that_was_not_adjusted_has_no_place_in_the_world(
+    placed: ExportContents, tmp_path: Path
+) -> None:
+    oriented = before(placed)
+    assert placed.adjusted is not None
+    first, _ = placed.adjusted.parts()
+    EXPORTERS["geojson"]()(replace(oriented, adjusted=first), tmp_path / "geojson")  # type: ignore[operator]
+    features = json.loads((tmp_path / "geojson" / "cameras.geojson").read_text())["features"]
+    assert [one["properties"]["image"] for one in features] == names(LARGE)
+    rows = orientation_text(first, oriented.block).splitlines()[1:]
+    assert [row.split(",")[0] for row in rows] == names(LARGE)
+
+
+def test_an_image_that_the_adjustment_brings_into_the_world_has_no_footprint_of_its_own_frame(
+    placed: ExportContents, truth: Truth, tmp_path: Path
+) -> None:
+    tied = replace(before(placed), adjusted=adjusted_block(truth))
+    EXPORTERS["geojson"]()(tied, tmp_path / "geojson")  # type: ignore[operator]
+    shown = {
+        name: [one["properties"]["image"] for one in json.loads((tmp_path / "geojson" / name).read_text())["features"]]
+        for name in ("cameras.geojson", "footprints.geojson")
+    }
+    assert shown == {"cameras.geojson": names((*LARGE, *SMALL)), "footprints.geojson": names(LARGE)}
 
 
 def test_maps_show_images_without_adjusted_pose_only_where_their_frame_is_known(

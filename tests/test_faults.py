@@ -48,6 +48,29 @@ def test_after_a_failed_adjustment_matches_are_judged_again(done_site: Site, mon
     assert (done_site.work / "orientation" / "dropped.npz").read_bytes() == dropped
 
 
+@pytest.mark.parametrize(
+    ("code", "said", "words"),
+    [
+        (-15, "", "the adjustment was ended by signal 15 (Terminated)"),
+        (
+            -11,
+            "a stack\nsegmentation fault",
+            "the adjustment was ended by signal 11 (Segmentation fault): segmentation fault",
+        ),
+        (3, "no such file", "the adjustment stopped with exit code 3: no such file"),
+        (3, "", "the adjustment stopped with exit code 3"),
+    ],
+)
+def test_how_a_process_has_ended_is_said_whether_or_not_it_said_why(
+    code: int, said: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = subprocess.CompletedProcess([], code, "", said)
+    monkeypatch.setattr(process.subprocess, "run", lambda *_, **__: ended)
+    with pytest.raises(InputError) as fault:
+        process.run_process("nothing", tmp_path, "result", "the adjustment")
+    assert str(fault.value) == words
+
+
 def test_a_process_has_one_thread_whatever_ran_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[dict[str, str]] = []
 

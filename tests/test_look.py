@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import os
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +18,12 @@ from PIL import Image
 from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.config.overview import first_settings
 from aeromatch_cli.config.schema import FAMILIES
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Pose
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.report.pictures import image_picture, pair_picture
+from aeromatch_cli.report.show import _pose_lines
 from aeromatch_cli.report.tiles import aligned
+from aeromatch_cli.workspace import Workspace
 
 SETTINGS = UNORIENTED
 
@@ -44,6 +50,31 @@ def test_matches_are_drawn_from_image_to_image_by_their_error() -> None:
     assert min(colours[1][:2]) > 200 > colours[1][2] + 100  # yellow
     assert colours[2][0] > colours[2][1] + 100  # red
     assert (picture[5, 84] == 255).all()  # between the images
+
+
+def test_poses_in_a_frame_of_their_own_have_no_origin_and_no_metres(tmp_path: Path) -> None:
+    """Image b belongs to a group that no position has placed: the origin of the CRS is none of its frame."""
+    workspace = Workspace(tmp_path)
+    world = {"crs": "EPSG:32617", "origin_m": [306000.0, 4545000.0, 0.0], "metric": True, "frames": {"b": 2}}
+    write_json(workspace.block, world)
+    down = np.diag([1.0, -1.0, -1.0])
+    places_m = {"a": np.array([10.0, 20.0, 300.0]), "b": np.array([0.0, -4.9561, 100.0])}
+    adjusted = replace(
+        AdjustedBlock.empty(), frames={"b": 1},
+        poses={i: AdjustedPose(place, down, np.full(3, 0.02), np.full(3, 0.1)) for i, place in places_m.items()},
+    )  # fmt: skip
+    poses = {i: Pose(place + 1.0, down, 0.5, 0.2) for i, place in places_m.items()}
+    work: Any = SimpleNamespace(workspace=workspace, poses=poses, adjusted=adjusted)
+    of_a, of_b = ([line for line in _pose_lines(work, i) if " x " in line] for i in "ab")
+    assert of_a == [
+        "pose        x 306011.000, y 4545021.000, z 301.000 m, standard deviation 0.5 m",
+        "adjusted    x 306010.000, y 4545020.000, z 300.000 m, standard deviation 0.02 m",
+    ]
+    unit = "units of arbitrary length"
+    assert of_b == [
+        f"pose        x 1.000, y -3.956, z 101.000 {unit} in frame own 2, standard deviation 0.5 {unit}",
+        f"adjusted    x 0.000, y -4.956, z 100.000 {unit} in frame own 1, standard deviation 0.02 {unit}",
+    ]
 
 
 @pytest.mark.slow

@@ -55,6 +55,17 @@ def test_without_adjustment_images_are_lost_that_no_pair_holds(tmp_path: Path) -
     assert lost_lines(Workspace(tmp_path), (), 8) == []
 
 
+def test_after_a_failed_adjustment_all_images_are_lost(tmp_path: Path) -> None:
+    """Connected ones too; of those that could not be read the reason is another."""
+    why = "the bundle adjustment was ended by signal 15 (Terminated)"
+    found = {"adjust": {"images": 0, "outside": dict.fromkeys(NAMES, why)}, "filter": {"unread": ["a6_jpg"]}}
+    lost = lost_images(filled(BlockResults, found), (), NAMES)
+    assert lost[0] == ("a0.jpg", "not oriented", why)
+    assert [what for _, what, _ in lost] == ["not oriented"] * 6 + ["not read", "not oriented"]
+    [line] = lost_lines(Workspace(tmp_path), lost, 8)
+    assert line.startswith("lost      8 of 8 images are not in the result (7 not oriented, 1 not read): a0.jpg, a1.jpg")
+
+
 @pytest.mark.parametrize("quiet", [False, True])
 def test_urgent_lines_are_said_once_on_the_right_stream(quiet: bool, capsys: pytest.CaptureFixture[str]) -> None:
     result = Result(("a summary", "result    bad: so it is"), verdict="bad", urgent=("result    bad: so it is",))

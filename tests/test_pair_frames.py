@@ -13,9 +13,8 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Image, Pair, Pose
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.cameras import from_colmap
-from aeromatch_cli.sfm.mapping import Group
+from aeromatch_cli.sfm.mapping import Group, own_frames
 from aeromatch_cli.stages.context import Context, Given
-from aeromatch_cli.stages.pairs import _frames
 from aeromatch_cli.workspace import Workspace
 
 CAMERA = from_colmap("PINHOLE", 800, 600, (700.0, 700.0, 400.0, 300.0))
@@ -30,12 +29,20 @@ def context(tmp_path: Path) -> Context:
         for number, name in enumerate(NAMES[:4])
     }
     images = tuple(Image(name, f"{name}.jpg", 800, 600, "k") for name in NAMES)
-    block = Block(images, {"k": CAMERA}, poses, "local", (0.0, 0.0, 0.0), ConstantGround(0.0), "given", 0.1)
-    pairs = tuple(Pair(one, two, 0.8, 5.0, "file") for n, one in enumerate(NAMES) for two in NAMES[n + 1 :])
     groups = [Group("positions", ("a", "b")), Group("level", ("c", "d"))]
-    return Context(
-        Settings(), Workspace(tmp_path), Executor("serial", 1), Given(block, {}), block, _frames(groups), pairs
+    block = Block(
+        images,
+        {"k": CAMERA},
+        poses,
+        "local",
+        (0.0, 0.0, 0.0),
+        ConstantGround(0.0),
+        "given",
+        0.1,
+        frames=own_frames(groups),
     )
+    pairs = tuple(Pair(one, two, 0.8, 5.0, "file") for n, one in enumerate(NAMES) for two in NAMES[n + 1 :])
+    return Context(Settings(), Workspace(tmp_path), Executor("serial", 1), Given(block, {}), block, pairs)
 
 
 def test_poses_count_where_both_lie_in_one_frame(context: Context) -> None:
@@ -62,6 +69,6 @@ def test_north_of_another_frame_is_another_north(context: Context) -> None:
 
 def test_fingerprints_tell_frames_apart(context: Context) -> None:
     needs = frozenset({"pose"})
-    plain = replace(context, frames={})
+    plain = replace(context, block=replace(context.block, frames={}))
     assert context.geometry_fingerprint("a", needs) == plain.geometry_fingerprint("a", needs)
     assert context.geometry_fingerprint("c", needs) != plain.geometry_fingerprint("c", needs)

@@ -10,8 +10,15 @@ from test_report import full, page_of  # noqa: F401
 
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, Pose
-from aeromatch_cli.report.adjustment import Adjustment, adjusted_poses, adjustment_notices, adjustment_rows, as_adjusted
-from aeromatch_cli.results.stages import AdjustResult, OrientResult
+from aeromatch_cli.report.adjustment import (
+    Adjustment,
+    adjusted_poses,
+    adjustment_notices,
+    adjustment_rows,
+    as_adjusted,
+    images_aside,
+)
+from aeromatch_cli.results.stages import AdjustResult, OrientResult, PairsResult
 from aeromatch_cli.sfm.block_figures import block_figures
 from aeromatch_cli.stages.stage_report import StageReport
 
@@ -51,6 +58,16 @@ def test_a_frame_of_its_own_has_no_metres(full):  # noqa: F811
     assert "metres" not in page.split('id="settings"')[0].replace("no metre", "")
 
 
+def test_pixels_on_the_ground_are_those_of_the_summary(full):  # noqa: F811
+    """Views have one common size for all images, those in frames of their own among them."""
+    first = StageReport("pairs", items=5, done=5)
+    first.result = filled(PairsResult, images=4, block={"metric": True, "gsd_m": 0.0484})
+    first.write(full.workspace)
+    views = replace(full, block=replace(full.block, gsd_m=0.0515))
+    assert "0.0484 m" in page_of(views)
+    assert "0.0515 m" not in page_of(views)
+
+
 def test_the_page_shows_the_block_as_it_was_adjusted():
     """Image b was left out by the first pass; c has a group of its own, whose frame is none of the block's."""
     given = {"a": pose(1.0), "c": pose(3.0), "d": pose(4.0)}
@@ -70,6 +87,20 @@ def test_the_page_shows_the_block_as_it_was_adjusted():
     one = as_adjusted(block, alone, in_world=False)
     assert {i: one.center_m[0] for i, one in one.poses.items()} == {"a": 10.0, "c": 12.0, "d": 4.0}
     assert {i: one.center_m[0] for i, one in adjusted_poses(adjusted).items()} == {"a": 10.0, "b": 11.0, "c": 12.0}
+
+
+def test_without_adjustment_the_page_leaves_out_images_in_other_frames():
+    """As where the adjustment has failed: c, and d and e, were oriented in frames of their own."""
+    given = {i: pose(float(k)) for k, i in enumerate("abcde")}
+    frames = {"c": 1, "d": 2, "e": 2}
+    block = Block((), {}, given, "EPSG:32617", (0.0, 0.0, 0.0), ConstantGround(0.0), "stated", 0.1, frames=frames)
+    assert images_aside(block, None, in_world=True) == {"c", "d", "e"}
+    assert sorted(as_adjusted(block, None, in_world=True).poses) == ["a", "b"]
+    own = replace(block, poses={i: given[i] for i in "cde"}, crs="local", metric=False)
+    assert sorted(as_adjusted(own, None, in_world=False).poses) == ["d", "e"]
+    # Of an adjustment that holds a alone, nothing is known of c in the world.
+    adjusted = replace(AdjustedBlock.empty(), poses={"a": moved(10.0)})
+    assert sorted(as_adjusted(block, adjusted, in_world=True).poses) == ["a", "b"]
 
 
 def test_cameras_count_from_the_corner_of_the_first_pixel_in_files_and_on_the_page():

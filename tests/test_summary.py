@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from make_results import filled
 
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_yaw_pitch_roll
-from aeromatch_cli.sfm.mapping import Group
-from aeromatch_cli.stages.pairs import _apart
+from aeromatch_cli.results.stages import OrientResult
+from aeromatch_cli.sfm.mapping import Group, own_frames
+from aeromatch_cli.stages.messages import frame_remarks
 
 CAMERA = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 ORIGIN = (333000.0, 3100000.0, 0.0)  # EPSG:32617
@@ -168,17 +170,56 @@ def test_missing_attitude_is_stated() -> None:
     assert words in summary.lines(given)
 
 
+def test_given_positions_that_a_frame_of_its_own_does_not_hold_are_said_to_be_given() -> None:
+    """Two images with positions are not oriented, four without are, in a frame of their own."""
+    whole = block()
+    given = summarise(replace(whole, poses={i: whole.poses[i] for i in ("img0", "img1")}))
+    oriented = {f"img{k}": whole.poses[f"img{k}"] for k in range(2, 6)}
+    own = summarise(replace(whole, poses=oriented, crs="local", metric=False, frames=dict.fromkeys(oriented, 1)))
+    assert "images           6, 2 with position, 2 with attitude, 1 camera" in given.given_lines()
+    lines = own.lines(given)
+    assert "outside frame    2: paired by name and time; the 2 given positions are not in it" in lines
+    assert not any("without position" in line for line in lines)
+    assert "outside frame    2: paired by name and time" in own.lines()
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [(0, "positions the result"), (2, "positions (2 given, none places a group of oriented images) the result")],
+)
+def test_a_frame_of_its_own_is_explained_by_the_positions_that_are_given(given: int, why: str) -> None:
+    found = filled(OrientResult, frame="own", positions_given=given)
+    (remark,) = frame_remarks(found, [Group("level", ("a", "b", "c"))])
+    assert remark == f"without usable {why} is in a frame of its own: scale, north and place are arbitrary"
+
+
 def test_images_are_apart_that_nothing_ties_to_the_world_or_to_the_largest_group() -> None:
     large, small, placed = Group("level", ("a", "b", "c")), Group("level", ("d", "e")), Group("positions", ("f",))
-    assert _apart([large, small]) == {"d", "e"}
-    assert _apart([placed, large, small]) == {"a", "b", "c", "d", "e"}
-    assert _apart([large]) == _apart([placed]) == _apart([]) == set()
+
+    def apart(*groups: Group) -> frozenset[str]:
+        poses = {i: Pose(np.zeros(3), np.eye(3), 1.0, 1.0) for group in groups for i in group.images}
+        return replace(block(), poses=poses, frames=own_frames(groups)).aside(in_world=False)
+
+    assert apart(large, small) == {"d", "e"}
+    assert apart(placed, large, small) == {"a", "b", "c", "d", "e"}
+    assert apart(large) == apart(placed) == apart() == set()
+    assert own_frames([placed, large, small]) == dict.fromkeys("abc", 1) | dict.fromkeys("de", 2)
 
 
-def test_the_extent_is_of_images_whose_places_to_each_other_are_known() -> None:
+def test_lengths_are_of_images_whose_places_to_each_other_are_known() -> None:
+    """Two images lie 1000 units aside and as high, in a frame of their own, and are tilted there."""
     found = block()
     assert "extent           100.0 m east-west, 25.0 m north-south" in summarise(found).lines()
-    far = {"img4", "img5"}
-    moved = {i: replace(p, center_m=p.center_m + 1000.0 * (i in far)) for i, p in found.poses.items()}
-    lines = summarise(replace(found, poses=moved), apart=far).lines()
-    assert "extent           60.0 m east-west, 15.0 m north-south, of 4 images that hang together" in lines
+    far = {"img4": 1, "img5": 1}
+    tilted = from_omega_phi_kappa(40.0, 0.0, 0.0)
+    moved = {
+        i: replace(p, center_m=p.center_m + 1000.0, world_rotation=tilted) if i in far else p
+        for i, p in found.poses.items()
+    }
+    summary = summarise(replace(found, poses=moved, frames=far))
+    alone = summarise(replace(found, images=found.images[:4]))
+    (words,) = (line for line in summary.lines() if line.startswith("extent"))
+    assert "60.0 m east-west, 15.0 m north-south, of 4 images that hang together; height, tilt and ground" in words
+    assert (summary.positioned, summary.oriented, summary.together) == (6, 6, 4)
+    assert summary.flying_height_m == pytest.approx(alone.flying_height_m)
+    assert (summary.gsd_m, summary.max_tilt_deg) == (pytest.approx(alone.gsd_m), pytest.approx(alone.max_tilt_deg))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -21,9 +21,10 @@ from aeromatch_cli.geometry.rotations import tilt_deg
 class BlockSummary:
     """Figures of a block; NaN where nothing is known. Heights are above the ground below each camera.
 
-    metric: whether lengths are metres; else the frame is the pictures' own. extent_m: east-west and north-south extent
-    of the projection centres, of so many `together` whose places to each other are known. best_overlap: mean over the
-    paired images of the overlap with their best neighbour. warnings: one sentence each: what, which images, what to do.
+    metric: whether lengths are metres; else the frame is the pictures' own. Heights, tilts, gsd_m (median) and extent_m
+    (east-west and north-south, of the projection centres) are of so many images `together` whose places to each other
+    are known. best_overlap: mean over the paired images of the overlap with their best neighbour. warnings: one
+    sentence each: what, which images, what to do.
     """
 
     images: int
@@ -65,7 +66,9 @@ class BlockSummary:
             found.append("scale            arbitrary: no position ties the frame to metres, or to north")
         if self.positioned:
             along = ("east-west", "north-south") if self.metric else ("along x", "along y")
-            parts = f", of {self.together} images that hang together" if self.together < self.positioned else ""
+            parts = ""
+            if self.together < self.positioned:
+                parts = f", of {self.together} images that hang together; height, tilt and ground sampling are theirs"
             found.append(f"extent           {length(east)} {along[0]}, {length(north)} {along[1]}{parts}")
         if np.isfinite(median):
             found.append(f"flying height    {length(median)} ({low:.1f} to {high:.1f}) above ground")
@@ -77,7 +80,7 @@ class BlockSummary:
             spacing = f"{100.0 * self.gsd_m:.2f} cm" if self.metric else length(self.gsd_m, 4)
             found.append(f"ground sampling  {spacing} per pixel")
         if self.positioned < self.images:
-            found.append(f"without position {self.images - self.positioned}: paired by name and time")
+            found.append(self._unplaced_line(0 if given is None else given.positioned))
         if self.oriented < self.positioned:
             refuted = given is not None and given.oriented > self.oriented
             why = "those given contradict the pictures and are not used; " if refuted else ""
@@ -92,6 +95,14 @@ class BlockSummary:
         if np.isfinite(self.best_overlap):
             found.append(f"overlap          {100.0 * self.best_overlap:.0f} % with the best neighbour, on average")
         return found
+
+    def _unplaced_line(self, given: int) -> str:
+        """Say how many images have no position, or none in a frame of the pictures' own. given: positions given."""
+        count, paired = self.images - self.positioned, "paired by name and time"
+        if self.metric:
+            return f"without position {count}: {paired}"
+        lie = "given position is not in it" if given == 1 else f"{given} given positions are not in it"
+        return f"outside frame    {count}: {paired}" + (f"; the {lie}" if given else "")
 
     def figures(self) -> dict[str, Any]:
         """Every field, JSON-ready: pairs_by_reason as a mapping, None for what is unknown, and for lengths that are no
@@ -109,23 +120,22 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def summarise(block: Block, pairs: Sequence[Pair] | None = None, apart: Collection[str] = ()) -> BlockSummary:
-    """Figures and plausibility of a block.
-
-    pairs: the chosen pairs, or None before they are chosen. apart: images whose distance from the others is arbitrary.
-    """
+def summarise(block: Block, pairs: Sequence[Pair] | None = None) -> BlockSummary:
+    """Figures and plausibility of a block. pairs: the chosen pairs, or None before they are chosen."""
     names = {image.image_id: image.name for image in block.images}
     poses = {i: block.poses[i] for i in names if i in block.poses and np.isfinite(block.poses[i].center_m).all()}
-    centers_m = np.array([pose.center_m for pose in poses.values()]).reshape(-1, 3)
-    together_m = centers_m[[image_id not in apart for image_id in poses]]
-    tilts_deg = [tilt_deg(pose.world_rotation) for pose in poses.values() if pose.world_rotation is not None]
-    gsds_m = [footprint.gsd_m for footprint in block_footprints(block).values()]
+    # Lengths and the vertical of a frame of its own are others than those of the first part.
+    apart = block.aside(in_world=False)
+    together = {image_id: pose for image_id, pose in poses.items() if image_id not in apart}
+    centers_m = np.array([pose.center_m for pose in together.values()]).reshape(-1, 3)
+    tilts_deg = [tilt_deg(pose.world_rotation) for pose in together.values() if pose.world_rotation is not None]
+    gsds_m = [footprint.gsd_m for i, footprint in block_footprints(block).items() if i not in apart]
     unpaired = () if pairs is None else _unpaired(names, pairs)
     return BlockSummary(
         images=len(block.images),
         cameras=len({image.camera_id for image in block.images}),
         positioned=len(poses),
-        oriented=len(tilts_deg),
+        oriented=sum(pose.world_rotation is not None for pose in poses.values()),
         crs=block.crs,
         metric=block.metric,
         origin_m=block.origin_m,
@@ -134,8 +144,8 @@ def summarise(block: Block, pairs: Sequence[Pair] | None = None, apart: Collecti
         mean_tilt_deg=_known(np.mean, tilts_deg),
         max_tilt_deg=_known(np.max, tilts_deg),
         gsd_m=_known(np.median, gsds_m),
-        extent_m=(_known(np.ptp, together_m[:, 0]), _known(np.ptp, together_m[:, 1])),
-        together=len(together_m),
+        extent_m=(_known(np.ptp, centers_m[:, 0]), _known(np.ptp, centers_m[:, 1])),
+        together=len(together),
         pairs=None if pairs is None else len(pairs),
         pairs_by_reason=tuple(sorted(Counter(pair.reason for pair in pairs or ()).items())),
         best_overlap=_known(np.mean, list(_best_overlaps(pairs or ()).values())),

@@ -32,7 +32,9 @@ the reduced ones. `aeromatch run WORK` follows them and makes the rest.
 - `metric`: whether lengths are metres; false in a frame of the pictures' own, whose scale is arbitrary: there every
   length of the workspace, whatever its name, counts in units of that frame.
 - `ground_source`: where the ground height comes from, in words. `ground_z_m`: world height, null with a DEM or none.
-- `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
+- `frames`: image_id -> number of the frame of its own that its group lies in before the adjustment. `poses.csv` puts
+  it aside of the others, where scale, north and place are arbitrary. Images that are not listed lie in the world.
+- `gsd_m`: common ground sampling distance of the views of all images, metres per pixel; null without attitudes.
 - `ground_fingerprint`: of the setting that the ground comes from.
 
 ### index.sqlite
@@ -284,15 +286,15 @@ line per pair), `conditions.csv`, plots as PNG.
 
 `database.db` and `sparse/{cameras,images,points3D}.txt` in COLMAP's own formats and pixel frame (this workspace's plus
 0.5). `sparse/` holds the adjusted block: cameras, oriented images with their keypoints, and triangulated points with
-their tracks; without orientation the given poses alone. The pose priors of the database are the given positions.
-`orientation.csv`, `residuals.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here
-plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
+their tracks; without adjustment the poses of the orientation, or those given, alone. The pose priors of the database
+are the given positions. `orientation.csv`, `residuals.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in
+the CRS is the one here plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
 
 Groups of images whose place beside each other is not known are models of their own. `sparse/` holds what positions have
 placed in the world, else the largest group; `sparse_own2/` is the model of the images with the frame `own 2` in
 `orientation.csv`, with a `world.json` of its own, since it lies in no CRS. Numbers of images and cameras are those of
 the database in all models; points are numbered model by model. `frames` of the upper `world.json` lists them: `model`
-(folder), `frame` (as in `orientation.csv`), `unit`, `images` (names). Where there is one frame, it is absent.
+(folder), `frame` (as in `orientation.csv`), `unit`, `images` (names). It is absent where all lie in the block's frame.
 """
 
 

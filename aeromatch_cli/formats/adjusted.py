@@ -114,7 +114,7 @@ def orientation_fields(adjusted: AdjustedBlock, block: Block, image: Image) -> d
         number = adjusted.frames.get(image.image_id)
         frame, sigmas = f"own {number}" if number else "world", [*pose.sigmas_m, *pose.sigmas_deg]
         center_m, rotation = pose.center_m, pose.rotation
-    elif known is not None:
+    elif known is not None and not (block.metric and image.image_id in block.frames):
         frame, sigmas = "predicted", [known.sigma_position_m] * 3 + [known.sigma_angle_deg] * 3
         center_m, rotation = known.center_m, known.world_rotation
     else:

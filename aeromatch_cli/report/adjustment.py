@@ -67,6 +67,12 @@ def adjusted_poses(adjusted: AdjustedBlock | None) -> dict[str, Pose]:
     return {i: Pose(pose.center_m, pose.rotation, math.nan, math.nan) for i, pose in adjusted.poses.items()}
 
 
+def images_aside(block: Block, adjusted: AdjustedBlock | None, *, in_world: bool) -> frozenset[str]:
+    """Images of groups whose place beside the first part is not known, as adjusted or, without adjustment, as
+    oriented."""
+    return (adjusted or block).aside(in_world=in_world)
+
+
 def as_adjusted(block: Block, adjusted: AdjustedBlock | None, *, in_world: bool) -> Block:
     """The block with adjusted poses and cameras in place of those that the first pass found: so the page shows it.
 
@@ -74,12 +80,15 @@ def as_adjusted(block: Block, adjusted: AdjustedBlock | None, *, in_world: bool)
     pictures' own frame is another one than that of the first pass, or the first pass may have had several, nothing of
     the first pass is left.
     """
+    aside = images_aside(block, adjusted, in_world=in_world)
     if adjusted is None:
-        return block
-    aside = adjusted.aside(in_world=in_world)
+        return replace(block, poses={i: pose for i, pose in block.poses.items() if i not in aside})
     found = {i: pose for i, pose in adjusted_poses(adjusted).items() if i not in aside}
     held = in_world or found.keys() <= block.poses.keys()
-    known = {i: pose for i, pose in block.poses.items() if i not in aside} if in_world or (held and not aside) else {}
+    known = dict(block.poses) if in_world or (held and not aside) else {}
+    # In the world images that lay in a frame of their own have a place only where the adjustment has given them one.
+    loose = aside | (block.frames.keys() if in_world else set())
+    known = {i: pose for i, pose in known.items() if i not in loose}
     return replace(
         block, poses={**known, **found}, cameras={**block.cameras, **adjusted.cameras},
         ground=block.ground if held else None,

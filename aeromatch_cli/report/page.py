@@ -31,6 +31,7 @@ from aeromatch_cli.report.adjustment import (
     camera_words,
     counted,
     final_points,
+    images_aside,
     read_adjustment,
     read_position_residuals,
     surveyed_rows,
@@ -77,7 +78,9 @@ def run(context: Context) -> StageReport:
     adjustment = read_adjustment(context)
     adjusted = final_points(context, adjustment)
     shown = as_adjusted(context.block, adjusted, in_world=adjustment.in_world)
-    found = gather(context, pair_table, adjustment.judged.spread, {**shown.poses, **adjusted_poses(adjusted)})
+    # Rows state of every image whether it has a pose, in whatever frame.
+    poses = context.block.poses if adjusted is None else {**shown.poses, **adjusted_poses(adjusted)}
+    found = gather(context, pair_table, adjustment.judged.spread, poses)
     with settled():
         page = render(context, found, adjustment, adjusted)
     write_text(context.workspace.report, page)
@@ -120,6 +123,8 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
     oriented = result_on_file(context.workspace, OrientResult)
     wrong = {} if oriented is None else oriented.wrong_attitudes
     block = result_on_file(context.workspace, PairsResult)
+    # Not that of the views, which is of images in frames of their own, too.
+    gsd_m = None if block is None else block.block.gsd_m
     matched = result_on_file(context.workspace, MatchResult)
     control = adjustment.found.control
     failures = failure_rows(context)
@@ -127,6 +132,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
     # Without a verified pair what is on file is of other keypoints.
     adjusted = adjusted if any(row.state == "verified" for row in pairs) else None
     placed = replace(context, block=as_adjusted(context.block, adjusted, in_world=adjustment.in_world))
+    aside = images_aside(context.block, adjusted, in_world=adjustment.in_world)
     quality = _quality(context, adjustment)
     shown = _worst_pairs(pairs)
     pictures = thumbnails(context)
@@ -154,7 +160,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
             adjusted,
             read_position_residuals(context, adjustment),
             {row.image_id: row.name for row in images},
-            context.block.gsd_m,
+            gsd_m,
             adjustment.found.groups,
         ),
         cameras=_cameras(context, adjustment, adjusted),
@@ -162,8 +168,8 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
         heights=heights_section(adjustment.found),
         residuals=surveyed_rows(control),
         residuals_after_fit=control is not None and control.transformation is not None,
-        block=_block_facts(context, in_world=adjustment.in_world),
-        map=_map(placed, images, pairs, wrong, pictures, adjusted, in_world=adjustment.in_world),
+        block=_block_facts(context, gsd_m, in_world=adjustment.in_world),
+        map=_map(placed, images, pairs, wrong, pictures, aside, in_world=adjustment.in_world),
         fields=_ground_figures(placed, adjusted, in_world=adjustment.in_world),
         histograms=[*_histograms(images, pairs), *point_figures(adjusted)],
         evaluation=evaluation_figures(context.workspace),
@@ -337,9 +343,9 @@ def notices(
     return found
 
 
-def _block_facts(context: Context, *, in_world: bool) -> list[tuple[str, str]]:
+def _block_facts(context: Context, gsd_m: float | None, *, in_world: bool) -> list[tuple[str, str]]:
+    """gsd_m: ground sampling distance in metres, None where it is not known."""
     block = context.block
-    gsd_m = block.gsd_m if in_world else None
     frame = f"{block.crs}, minus the origin {' / '.join(f'{value:,.0f}' for value in block.origin_m)}"
     return [
         ("World frame", frame if in_world else "the pictures' own: scale, north and place are arbitrary"),
@@ -378,11 +384,12 @@ def _map(
     pairs: Sequence[PairRow],
     wrong: Mapping[str, float],
     pictures: Mapping[str, NDArray[np.uint8]],
-    adjusted: AdjustedBlock | None,
+    aside: frozenset[str],
     *,
     in_world: bool,
 ) -> MapFigure | None:
-    """None where no image has a position. pictures: reduced ones, for the sketch of the ground."""
+    """None where no image has a position. pictures: reduced ones, for the sketch of the ground. aside: images of groups
+    that lie in frames of their own."""
     stations = []
     for row, label in zip(images, _labels([row.name for row in images]), strict=True):
         pose = context.pose(row.image_id)
@@ -398,7 +405,6 @@ def _map(
         return None
     footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]
     sketch = partial(ground_sketch, context, pictures)
-    aside = frozenset[str]() if adjusted is None else adjusted.aside(in_world=in_world)
     links = [_link(row) for row in pairs]
     return block_map(stations, footprints, links, in_world=in_world, aside=aside, sketch=sketch)
 

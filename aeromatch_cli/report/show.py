@@ -229,15 +229,19 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
 def _pose_lines(work: _Work, image_id: str) -> Iterator[str]:
     """Say the pose of an image as it is known, and as it was adjusted."""
     world = read_json(work.workspace.block)
-    origin_m, metric = world["origin_m"], world.get("metric", True)  # those of earlier versions do not say
-    for words in _pose_words(work.poses.get(image_id), origin_m, metric=metric):
+    origin_m = world["origin_m"]
+    # Those of earlier versions do not say what frames are.
+    frame = world.get("frames", {}).get(image_id, 0)
+    metric = world.get("metric", True) and not frame
+    for words in _pose_words(work.poses.get(image_id), origin_m, frame, metric=metric):
         yield f"pose        {words}"
     if work.adjusted is None or image_id not in work.adjusted.poses:
         return
     adjusted = work.adjusted.poses[image_id]
     sigmas = float(np.mean(adjusted.sigmas_m)), float(np.mean(adjusted.sigmas_deg))
     known = Pose(adjusted.center_m, adjusted.rotation, *sigmas)
-    for words in _pose_words(known, origin_m, metric=image_id not in work.adjusted.frames):
+    frame = work.adjusted.frames.get(image_id, 0)
+    for words in _pose_words(known, origin_m, frame, metric=not frame):
         yield f"adjusted    {words}"
 
 
@@ -282,16 +286,19 @@ def _own_file(workspace: Workspace, name: str) -> Path:
     return folder / name
 
 
-def _pose_words(pose: Pose | None, origin_m: Sequence[float], *, metric: bool) -> Iterator[str]:
+def _pose_words(pose: Pose | None, origin_m: Sequence[float], frame: int, *, metric: bool) -> Iterator[str]:
+    """frame: number of the frame of its own that the pose lies in, 0 in the world."""
     if pose is None:
         yield "unknown"
         return
-    x, y, z = np.array(pose.center_m) + np.array(origin_m)
+    # An origin of the CRS would make places of a frame that has none look like those of a map.
+    x, y, z = np.array(pose.center_m) + np.array(origin_m) * metric
     unit = "m" if metric else "units of arbitrary length"
+    where = f" in frame own {frame}" if frame else ""
     exact = f"standard deviation {pose.sigma_position_m:.3g} {unit}"
     if not metric and pose.sigma_position_m > LOCAL_FLYING_HEIGHT:
         exact = "its distance is not determined by the matches"
-    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} {unit}, {exact}"
+    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} {unit}{where}, {exact}"
     if pose.world_rotation is not None:
         angles = ", ".join(f"{v:.4f}" for v in to_omega_phi_kappa(pose.world_rotation))
         yield f"omega, phi, kappa {angles} degrees, {tilt_deg(pose.world_rotation):.1f} from straight down"

@@ -216,7 +216,7 @@ class AdjustedCamera(NamedTuple):
 
 
 class AdjustResult(StageResult):
-    """The bundle adjustment; without oriented images only `images` and `remarks`."""
+    """The bundle adjustment; without oriented images only `images`, `outside`, `stopped` and `remarks`."""
 
     stage: ClassVar[str] = "adjust"
 
@@ -234,6 +234,7 @@ class AdjustResult(StageResult):
     positions_given: int = 0
     reduced: float = Field(1.0, description="Stored pixels in a pixel of the picture that keypoints were found in.")
     outside: dict[str, str] = Field({}, description="Images without adjusted pose -> reason.")
+    stopped: str = Field("", description="Why the adjustment stopped, empty where it did not.")
     held_by: dict[str, str] = Field({}, description="Parameter of cameras -> setting that holds it.")
     readout_not_tried: str | None = Field(
         None, description="Why the read-out time of a rolling shutter was no unknown, null where it was."

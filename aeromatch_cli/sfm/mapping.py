@@ -108,6 +108,12 @@ class Group:
     images: tuple[str, ...]
 
 
+def own_frames(groups: Sequence[Group]) -> dict[str, int]:
+    """Number the frames of groups that no position has placed in the world: image_id -> number, from 1."""
+    loose = [group.images for group in groups if group.kind == "level"]
+    return {image_id: number for number, images in enumerate(loose, start=1) for image_id in images}
+
+
 def adjust_block(
     contents: ExportContents, observed: Observed, groups: Sequence[Group], *, fixed: bool
 ) -> tuple[AdjustedBlock, list[GroupResult]]:
@@ -188,7 +194,9 @@ def _task(contents: ExportContents, observed: Observed) -> Iterator[Path]:
     image_ids = _image_ids(contents.block)
     with tempfile.TemporaryDirectory(prefix="aeromatch-") as scratch:
         folder = Path(scratch) / "task"
-        Colmap(raw_matches=False, pose_priors=False)(contents, folder)
+        # One model of all groups: the process takes each from it, whatever its frame.
+        whole = replace(contents, block=replace(contents.block, frames={}))
+        Colmap(raw_matches=False, pose_priors=False)(whole, folder)
         cameras = {
             str(number): _camera_task(contents.block, k, observed)
             for number, k in enumerate(sorted(contents.block.cameras), start=1)

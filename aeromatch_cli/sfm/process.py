@@ -31,8 +31,15 @@ def run_process(module: str, folder: Path, result: str, what: str) -> Path:
         raise MemoryError(f"{what} ended for lack of memory")
     if done.returncode or not (folder / result).is_file():
         said = " ".join((done.stderr or done.stdout).strip().splitlines()[-1:])
-        raise InputError(f"{what} stopped with exit code {done.returncode}: {said}")
+        raise InputError(f"{what} {_ended(done.returncode)}" + (f": {said}" if said else ""))
     return folder / result
+
+
+def _ended(code: int) -> str:
+    """How a process has ended, in words. code: negative where a signal ended it."""
+    if code >= 0:
+        return f"stopped with exit code {code}"
+    return f"was ended by signal {-code} ({signal.strsignal(-code) or 'unknown'})"
 
 
 def quiet_pycolmap() -> ModuleType:

@@ -22,7 +22,7 @@ from aeromatch_cli.results.adjustment import Control, GroupResult
 from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.sfm.block_figures import block_figures, residual_figures, residuals_of
 from aeromatch_cli.sfm.calibration import held_by
-from aeromatch_cli.sfm.mapping import Group, adjust_block
+from aeromatch_cli.sfm.mapping import Group, adjust_block, own_frames
 from aeromatch_cli.sfm.mapping_process import LARGE_BLOCK
 from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES
 from aeromatch_cli.stages import orient
@@ -58,7 +58,7 @@ def run(context: Context) -> StageReport:
     _remove(context)
     context, groups, words = _with_more_images(context, groups)
     if not groups:
-        report.result = AdjustResult(images=0, remarks=[_NOTHING])
+        report.result = AdjustResult(images=0, remarks=[_NOTHING], outside=_none_adjusted(context, without_results))
         return report.write(context.workspace)
     try:
         with context.executor.step("adjust"):
@@ -66,7 +66,9 @@ def run(context: Context) -> StageReport:
             adjusted, found = adjust_block(contents, context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
-        report.result = AdjustResult(images=0, remarks=[f"not done: {error}"])  # not that of an earlier adjustment
+        stopped, outside = str(error), _none_adjusted(context, without_results, str(error))
+        # Not that of an earlier adjustment.
+        report.result = AdjustResult(images=0, remarks=[f"not done: {stopped}"], stopped=stopped, outside=outside)
         return report.write(context.workspace)
     residuals = _residuals(context, adjusted)
     result = _result(context, adjusted, found, residuals, without_results)
@@ -74,6 +76,13 @@ def run(context: Context) -> StageReport:
     report.done = report.items
     report.record_files(context, _write(context, adjusted, residuals))
     return report.write(context.workspace)
+
+
+def _none_adjusted(context: Context, without_results: Sequence[Pair], stopped: str = "") -> dict[str, str]:
+    """Return why no image is adjusted, by image_id; nothing of two images, which have no adjustment."""
+    if len(context.block.images) < FEWEST_IMAGES:
+        return {}
+    return unregistered_reasons(context, AdjustedBlock.empty(), without_results, stopped)
 
 
 def _with_more_images(context: Context, groups: Sequence[Group]) -> tuple[Context, Sequence[Group], list[str]]:
@@ -90,7 +99,7 @@ def _with_more_images(context: Context, groups: Sequence[Group]) -> tuple[Contex
     images = set() if found is None else _images(found.groups)
     if found is None or len(images) <= len(oriented):
         return context, groups, []
-    block = replace(context.block, cameras=found.cameras, poses=found.poses)
+    block = replace(context.block, cameras=found.cameras, poses=found.poses, frames=own_frames(found.groups))
     words = f"oriented from the verified matches: {len(images)} images, {len(oriented)} from the first pass"
     names = {image.image_id: image.name for image in context.block.images}
     return replace(context, block=block), found.groups, [words, *single_pair_words(found.result, names)]

@@ -154,6 +154,7 @@ def block_record(block: Block, given: Block, settings: Settings) -> dict[str, An
         "crs": block.crs,
         "origin_m": list(block.origin_m),
         "metric": block.metric,
+        "frames": dict(sorted(block.frames.items())),
         "given_crs": given.crs,
         "given_origin_m": list(given.origin_m),
         "ground_source": block.ground_source,

@@ -98,8 +98,6 @@ class Context:
     settings: the resolved settings. workspace: the paths of the workspace's files. executor: runs the tasks of stages.
     given: what was given of the block.
     block: images, cameras, poses and ground in the world frame, oriented once `stages.orient` has run.
-    frames: image_id -> number of the frame of its own, from 1, of an image that nothing ties to the world; absent where
-    it lies in the world.
     pairs: the pairs of pairs.csv, in its order.
     scope: the part of the work that is done.
     index: what is known of the files of the workspace.
@@ -113,7 +111,6 @@ class Context:
     executor: Executor
     given: Given
     block: Block
-    frames: Mapping[str, int] = field(default_factory=dict)
     pairs: tuple[Pair, ...] = ()
     scope: Scope = field(default_factory=Scope)
     index: Index = field(default_factory=Index, repr=False)
@@ -245,7 +242,7 @@ class Context:
     def _share_frame(self, image_id0: str, image_id1: str) -> bool:
         """Whether the poses of two images, as far as there are two, lie in one frame."""
         posed = self.block.poses.keys() >= {image_id0, image_id1}
-        return not posed or self.frames.get(image_id0) == self.frames.get(image_id1)
+        return not posed or self.block.frames.get(image_id0) == self.block.frames.get(image_id1)
 
     def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
         """Return from where else the ground of an image is looked at: the images it is paired with that have an
@@ -287,8 +284,8 @@ class Context:
             parts["camera"] = self.block.camera(self.image_by_id[image_id])
         if "pose" in needs:
             parts["pose"] = (pose.center_m, pose.world_rotation) if pose else None
-            if image_id in self.frames:
-                parts["frame"] = self.frames[image_id]
+            if image_id in self.block.frames:
+                parts["frame"] = self.block.frames[image_id]
         if "sigma" in needs:
             parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
         if "ground" in needs:

@@ -25,7 +25,7 @@ def lost_images(results: BlockResults, unread: Sequence[tuple[str, str]], names:
     lost = [(name, _FAILED, reason) for name, reason in unread]
     links = results.connection
     failed = [] if links is None else links.unread
-    if results.adjust is not None and results.adjust.images:
+    if results.adjust is not None and (results.adjust.images or results.adjust.outside):
         outside = results.adjust.outside.items()
         lost += [(names.get(i, i), _FAILED if i in failed else _UNORIENTED, reason) for i, reason in outside]
     elif links is not None:

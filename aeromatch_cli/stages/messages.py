@@ -170,13 +170,15 @@ def frame_remarks(found: OrientResult, groups: Sequence[Group]) -> list[str]:
     beside = sum(len(group.images) for group in groups if group.kind == "level")
     if not beside:
         return []
+    given = found.positions_given
+    why = "without usable positions" + (f" ({given} given, none places a group of oriented images)" if given else "")
     if found.frame == "own" and len(groups) > 1:
         return [
-            f"without usable positions each of {len(groups)} groups of images is in a frame of its own: scale, north "
+            f"{why} each of {len(groups)} groups of images is in a frame of its own: scale, north "
             "and place are arbitrary, and so is the distance between the groups"
         ]
     if found.frame == "own":
-        return ["without usable positions the result is in a frame of its own: scale, north and place are arbitrary"]
+        return [f"{why} the result is in a frame of its own: scale, north and place are arbitrary"]
     return [
         f"{beside} images are tied to no position and lie beside the others: scale, north and place are arbitrary, "
         "unless final matches tie them"

@@ -24,7 +24,7 @@ from aeromatch_cli.results.stages import FurtherFirstPass, OrientResult
 from aeromatch_cli.sfm.dem import Terrain, continued
 from aeromatch_cli.sfm.earlier_datum import Before
 from aeromatch_cli.sfm.focal import better_cameras
-from aeromatch_cli.sfm.mapping import Group
+from aeromatch_cli.sfm.mapping import Group, own_frames
 from aeromatch_cli.sfm.solution import (
     FirstPassMatches,
     Solution,
@@ -132,6 +132,7 @@ def run(
         similar=tuple(record.similar),
         outside=frozenset(found.outside),
         calibrated=frozenset(found.calibrated),
+        frames=own_frames(_groups(record)),
     )
     report.failures = _failed_images(context, record.failed)
     if found.stopped:

@@ -17,7 +17,6 @@ from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
 from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import OrientResult, PairsResult
-from aeromatch_cli.sfm.mapping import Group
 from aeromatch_cli.stages import orient, picture_quality
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
 from aeromatch_cli.stages.context import Context, Scope
@@ -74,11 +73,10 @@ def prepare(
     known += looks
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
     report.started += oriented.seconds  # has its own report
-    groups = orient.groups(context)
-    context = _with_ground(replace(context, frames=_frames(groups)), found)
+    context = _with_ground(context, found)
     report.fingerprint = _fingerprint(context)
     pairs = _listed(context, report, anew=overwrite or dry)
-    summary, pairs_csv = summarise(context.block, pairs, _apart(groups)), pairs_text(pairs)
+    summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
     as_oriented = oriented.result if isinstance(oriented.result, OrientResult) else None
     oriented_lines = [] if as_oriented is None else orientation_lines(as_oriented, found.given.block, context.block)
     remarks = [] if as_oriented is None else as_oriented.remarks
@@ -105,19 +103,6 @@ def prepare(
         forget_absent(context)
         report.write(workspace)
     return context, oriented, report
-
-
-def _frames(groups: Sequence[Group]) -> dict[str, int]:
-    """image_id -> number of the frame of its own, from 1, of images of groups that nothing ties to the world."""
-    loose = [group for group in groups if group.kind == "level"]
-    return {image_id: number for number, group in enumerate(loose, start=1) for image_id in group.images}
-
-
-def _apart(groups: Sequence[Group]) -> set[str]:
-    """Images of the groups that nothing ties to the world; where there are no others, not those of the largest."""
-    loose = sorted((set(group.images) for group in groups if group.kind == "level"), key=len)
-    kept = loose[-1] if len(loose) == len(groups) > 0 else set()
-    return set().union(*loose) - kept
 
 
 def warn(warnings: Iterable[str], urgent: Collection[str] = ()) -> None:

@@ -30,6 +30,7 @@ def quality_of(results: BlockResults, names: Mapping[str, str]) -> Quality | Non
             adjust=adjust.model_copy(update={"outside": outside}),
             orient=results.orient,
             components=tuple(links.components or ()),
+            components_before=len(results.filter.components),
             contradicted=None if consistency is None else _contradicted(consistency),
             contradicting=() if consistency is None else tuple(consistency.doubtful),
             refined=refined is not None and (refined.measured or 0) > _MEASURED * (refined.keypoints or 1),

@@ -19,10 +19,10 @@ _FEW_KEYPOINTS = 0.1
 
 
 def unregistered_reasons(
-    context: Context, adjusted: AdjustedBlock, without_results: Sequence[Pair] = ()
+    context: Context, adjusted: AdjustedBlock, without_results: Sequence[Pair] = (), stopped: str = ""
 ) -> dict[str, str]:
     """image_id -> why it is not oriented. without_results: pairs beside those of the context, which are not verified
-    by the present settings."""
+    by the present settings. stopped: why the adjustment has failed, where it has."""
     outside = [i.image_id for i in context.block.images if i.image_id not in adjusted.poses]
     if not outside:
         return {}
@@ -46,7 +46,7 @@ def unregistered_reasons(
         count = keypoints[image_id]
         if image_id in unread:
             reasons[image_id] = f"no features: {unread[image_id]}"
-        elif count <= _FEW_KEYPOINTS * usual:
+        elif count <= _FEW_KEYPOINTS * usual and not context.settings.match.reads_pixels:
             seen = degenerate_view(context.workspace, context.image_by_id[image_id]) or "no texture, or blurred"
             reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: {seen}"
         elif not pairs[image_id] and failed[image_id]:
@@ -56,7 +56,8 @@ def unregistered_reasons(
         elif not verified[image_id]:
             reasons[image_id] = f"none of its {pairs[image_id]} pairs could be verified"
         elif not adjusted.poses:
-            reasons[image_id] = f"no image could be oriented ({verified[image_id]} verified pairs of this one)"
+            some = f"no image could be oriented ({verified[image_id]} verified pairs of this one)"
+            reasons[image_id] = stopped or some
         elif not tied[image_id]:
             reasons[image_id] = f"its {verified[image_id]} verified pairs are with images that are not oriented either"
         else:

@@ -43,6 +43,9 @@ def connection(evidence: QualityInput) -> Iterator[Finding]:
         return
     shown = ", ".join(map(str, sizes[:5])) + (", ..." if len(sizes) > 5 else "")
     words = f"{len(sizes)} groups of images ({shown}) that no verified pair connects"
+    if 0 < evidence.components_before < len(sizes):
+        before = "one" if evidence.components_before == 1 else f"{evidence.components_before}"
+        words += f", {before} before the stage consistency dropped matches"
     hidden = "; --set pairs=exhaustive finds pairs that positions hide" if evidence.hidden_pairs else ""
     yield finding_of("connection", beside, _LEFT_OUT, words, f"more overlap between them helps{hidden}")
 
@@ -83,6 +86,9 @@ def frames(evidence: QualityInput) -> Found:
             f"{parts} parts whose scale and place nothing ties to each other: positions (--poses) place each of them"
         )
         yield Finding("parts", float(parts), 1.0, "bad", words)
+    elif parts > 1:
+        loose = [group.images for group in evidence.groups if group.kind == "level"]
+        yield _loose_parts(loose if len(loose) < len(kinds) else loose[1:])  # the largest is the first
     yield from _placed_parts(evidence)
     given = positions_given(evidence)
     used = sum(group.positions.used for group in evidence.groups if group.positions)
@@ -91,16 +97,25 @@ def frames(evidence: QualityInput) -> Found:
     surveyed = sum(len(group.control.used) for group in evidence.groups if group.control)
     if used >= _HOLDING or surveyed >= _HOLDING or kept:
         return
-    if given >= _HOLDING:
+    orient = evidence.orient
+    if given >= _HOLDING and orient is not None and not any(model.contradiction for model in orient.models):
+        words = (
+            f"none of the {given} given positions is used: too few are of images that are oriented together, or they "
+            "are all of one place"
+        )
+        yield Finding("positions", 1.0, WRONG_POSITIONS[0], "bad", words)
+    elif given >= _HOLDING:
         words = (
             f"none of the {given} given positions is used, the pictures contradict them: check the coordinate "
             "system, the order of x and y, and which position belongs to which image"
         )
         yield Finding("positions", 1.0, WRONG_POSITIONS[0], "bad", words)
     else:
+        what = "the given position is" if given == 1 else f"the {given} given positions are"
+        enough = f"{what} not enough, those (--poses) of three images that are oriented together are"
         words = (
-            "shape only: nothing ties the block to the ground, place, north and scale are arbitrary: positions "
-            "(--poses) do; control points alone show how the block is to be moved"
+            "shape only: nothing ties the block to the ground, place, north and scale are arbitrary: "
+            f"{enough if given else 'positions (--poses) do'}; control points alone show how the block is to be moved"
         )
         yield Finding("ground", None, None, "doubtful", words)
 
@@ -147,6 +162,19 @@ def _placed_parts(evidence: QualityInput) -> Iterator[Finding]:
         "each tie them"
     )
     yield Finding("parts", float(exact_m / pixel_m), None, "doubtful", words)
+
+
+def _loose_parts(images: Sequence[int]) -> Finding:
+    """Say that parts which no pair ties to the others lie in frames of their own. images: of each."""
+    if len(images) == 1:
+        words, them = f"1 part ({images[0]} images) has a frame of its own", "it"
+    else:
+        words, them = f"{_sizes(images)} have frames of their own", "each"
+    words += (
+        f": scale, north and place are arbitrary there; export=colmap writes a model of {them}, and "
+        f"positions (--poses) of its images place {them}"
+    )
+    return Finding("parts", float(len(images) + 1), 1.0, "doubtful", words)
 
 
 def _sizes(parts: Sequence[int]) -> str:

@@ -57,17 +57,19 @@ class QualityInput(Record):
     """Holds what a block is judged by.
 
     images: of the block. adjust, orient: results of these stages. components: sizes of the groups of images that
-    verified pairs connect, the largest first. refined: whether tie points were measured by least squares. contradicted:
-    share of the verified matches that the adjusted block contradicts, None where it is not known; contradicting: ids of
-    images of which it contradicts most. reduced: stored pixels in a pixel of the pictures that keypoints were found in.
-    names: of the files, by image_id. unread: ids of images beside these whose pictures could not be read. hidden_pairs:
-    whether given positions have kept pairs from being compared.
+    verified pairs connect, the largest first; components_before: how many these were before the stage consistency
+    dropped matches, 0 where that is not known. refined: whether tie points were measured by least squares.
+    contradicted: share of the verified matches that the adjusted block contradicts, None where it is not known;
+    contradicting: ids of images of which it contradicts most. reduced: stored pixels in a pixel of the pictures that
+    keypoints were found in. names: of the files, by image_id. unread: ids of images beside these whose pictures could
+    not be read. hidden_pairs: whether given positions have kept pairs from being compared.
     """
 
     images: int
     adjust: AdjustResult
     orient: OrientResult | None = None
     components: tuple[int, ...] = ()
+    components_before: int = 0
     refined: bool = False
     contradicted: float | None = None
     contradicting: tuple[str, ...] = ()

@@ -38,7 +38,14 @@ def judged(evidence: QualityInput) -> Quality:
                 else:
                     unchecked.append(found)
     elif evidence.images > 2:
-        if evidence.adjust.remarks:
+        stopped = evidence.adjust.stopped or ("" if evidence.orient is None else evidence.orient.stopped)
+        if stopped:
+            words = (
+                f"no image is adjusted: {stopped}; the same command tries again; matches are exported all the same, "
+                "and poses as far as they were known before"
+            )
+            findings.append(Finding("oriented images", 0.0, None, "bad", words))
+        elif evidence.adjust.remarks:
             words = (
                 "no image is oriented: more overlap, or known positions and attitudes (--poses) and cameras "
                 "(--cameras) help; matches are exported all the same"

@@ -16,7 +16,7 @@ import signal
 import sqlite3
 import threading
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +26,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import AdjustedBlock, Block, Camera, FloatArray, Image, IntArray, Pose
+from aeromatch_cli.data import AdjustedBlock, Block, Camera, FloatArray, Image, IntArray, Pose, by_frame
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.formats.adjusted import orientation_text, residuals_text
 from aeromatch_cli.geometry.cameras import colmap_camera
@@ -36,7 +36,7 @@ from aeromatch_cli.geometry.lenses import in_colmap
 from aeromatch_cli.geometry.rotations import to_quaternion
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, held, write_world
+from aeromatch_cli.strategies.exporters.solution import Solution, adjusted_poses, held, known_poses, write_world
 
 # Ours (pixel centre) to COLMAP's pixel frame (corner).
 _COLMAP_FROM_PX = np.array([[1.0, 0.0, COLMAP_OFFSET_PX], [0.0, 1.0, COLMAP_OFFSET_PX], [0.0, 0.0, 1.0]])
@@ -70,7 +70,9 @@ class Colmap(Strategy):
             counts = self._write_database(contents, lenses, ids, partial / "database.db")
             cameras, remarks = held(Solution.of(contents), "COLMAP", in_colmap)
             models = _models(contents)
-            posed = sum(write_model(contents, part, cameras, ids, partial / name) for name, part in models.items())
+            for name, model in models.items():
+                write_model(contents, model, cameras, ids, partial / name)
+            posed = sum(len(model.poses) for model in models.values())
             remarks += _models_remark(models)
             if contents.adjusted is not None:
                 text = orientation_text(contents.adjusted, contents.block)
@@ -259,52 +261,65 @@ def import_pycolmap() -> ModuleType:
     return pycolmap
 
 
-def _models(contents: ExportContents) -> dict[str, AdjustedBlock | None]:
-    """Folder of every model -> its part of the adjusted block, the first part in `sparse`; None: the given poses."""
-    if contents.adjusted is None:
-        return {_SPARSE: None}
-    first, *others = contents.adjusted.parts()
-    return {_SPARSE: first, **{f"{_SPARSE}_own{_frame(part)}": part for part in others}}
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Images of one frame: poses by image_id. frame: number of the frame of their own, 0 in the world. adjusted: their
+    part of the adjusted block; None before the adjustment: poses without points."""
+
+    poses: Mapping[str, tuple[FloatArray, FloatArray]]
+    frame: int
+    adjusted: AdjustedBlock | None
 
 
-def _frame(part: AdjustedBlock) -> int:
+def _models(contents: ExportContents) -> dict[str, Model]:
+    """Folder -> model of every frame, the first one in `sparse`."""
+    block, adjusted = contents.block, contents.adjusted
+    if adjusted is None:
+        known = known_poses(block)
+        parts = by_frame(known, block.frames) or [[]]
+        models = [Model({i: known[i] for i in part}, _frame(part, block.frames), None) for part in parts]
+    else:
+        models = [Model(adjusted_poses(part), _frame(part.poses, part.frames), part) for part in adjusted.parts()]
+    first, *others = models
+    return {_SPARSE: first, **{f"{_SPARSE}_own{model.frame}": model for model in others}}
+
+
+def _frame(image_ids: Iterable[str], frames: Mapping[str, int]) -> int:
     """The number of the frame of its own that a part lies in, 0 in the world."""
-    return next(iter(part.frames.values()), 0)
+    return frames.get(next(iter(image_ids), ""), 0)
 
 
-def _models_remark(models: Mapping[str, AdjustedBlock | None]) -> list[str]:
-    sizes = [f"{name} ({len(part.poses)} images)" for name, part in models.items() if part is not None]
+def _models_remark(models: Mapping[str, Model]) -> list[str]:
+    sizes = [f"{name} ({len(model.poses)} images)" for name, model in models.items()]
     if len(sizes) < 2:
         return []
     return [f"groups of images whose place beside each other is not known are models of their own: {', '.join(sizes)}"]
 
 
-def _write_worlds(folder: Path, block: Block, models: Mapping[str, AdjustedBlock | None]) -> None:
-    """world.json, with the images of every frame where there are several, and in the folder of every further model."""
+def _write_worlds(folder: Path, block: Block, models: Mapping[str, Model]) -> None:
+    """world.json, with the images of every frame where there is another than the block's own, and one in the folder of
+    every model that lies in such."""
     names = {image.image_id: image.name for image in block.images}
     frames = []
-    for model, part in models.items():
-        if part is not None and len(models) > 1:
-            frame = f"own {_frame(part)}" if part.frames else "world"
-            unit = "m" if block.metric and not part.frames else "arbitrary"
-            images = sorted(names[image_id] for image_id in part.poses)
-            frames.append({"model": model, "frame": frame, "unit": unit, "images": images})
+    elsewhere = [name for name, model in models.items() if name != _SPARSE or (block.metric and model.frame)]
+    for name, model in models.items() if elsewhere else ():
+        frame = f"own {model.frame}" if model.frame else "world"
+        unit = "m" if block.metric and not model.frame else "arbitrary"
+        images = sorted(names[image_id] for image_id in model.poses)
+        frames.append({"model": name, "frame": frame, "unit": unit, "images": images})
     write_world(folder, block, frames)
-    for name in models.keys() - {_SPARSE}:
+    for name in elsewhere:
         write_world(folder / name, replace(block, crs="local", origin_m=(0.0, 0.0, 0.0), metric=False))
 
 
 def write_model(
-    contents: ExportContents, adjusted: AdjustedBlock | None, cameras: Mapping[str, Camera], ids: Numbers, sparse: Path
-) -> int:
-    """cameras.txt, images.txt and points3D.txt in the new folder `sparse`; returns the number of images with a pose.
-
-    adjusted: the block, or the part of it that the model holds; None: the given poses. cameras: by camera_id, those
-    that COLMAP can hold.
-    """
+    contents: ExportContents, model: Model, cameras: Mapping[str, Camera], ids: Numbers, sparse: Path
+) -> None:
+    """cameras.txt, images.txt and points3D.txt in the new folder `sparse`. cameras: by camera_id, those that COLMAP can
+    hold."""
     sparse.mkdir()
-    block = contents.block
-    posed = _posed_images(block) if adjusted is None else _adjusted_images(block, adjusted)
+    adjusted = model.adjusted
+    posed = [(image, *model.poses[image.image_id]) for image in contents.block.images if image.image_id in model.poses]
     (sparse / "cameras.txt").write_text(_cameras_text(cameras, ids), encoding="utf-8")
     with (sparse / "images.txt").open("w", encoding="utf-8") as stream:
         stream.write("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n")
@@ -326,22 +341,6 @@ def write_model(
         for image, _, _ in posed:
             reconstruction.images[ids.image[image.image_id]].name = image.name
         reconstruction.write_binary(sparse)
-    return len(posed)
-
-
-def _posed_images(block: Block) -> list[tuple[Image, FloatArray, FloatArray]]:
-    """Image, world_rotation (3, 3) and centre (3,) of every image whose position and attitude are known."""
-    posed = []
-    for image in block.images:
-        pose = block.poses.get(image.image_id)
-        if pose is not None and pose.world_rotation is not None:
-            posed.append((image, pose.world_rotation, pose.center_m))
-    return posed
-
-
-def _adjusted_images(block: Block, adjusted: AdjustedBlock) -> list[tuple[Image, FloatArray, FloatArray]]:
-    found = ((image, adjusted.poses.get(image.image_id)) for image in block.images)
-    return [(image, pose.rotation, pose.center_m) for image, pose in found if pose is not None]
 
 
 def _cameras_text(cameras: Mapping[str, Camera], ids: Numbers) -> str:

@@ -32,7 +32,8 @@ class Links:
 
     @classmethod
     def of(cls, contents: ExportContents, solution: Solution, found: Matched) -> Links:
-        beside = unplaced(contents)
+        # Images that lay in frames of their own have a place in the world only where the adjustment gave them one.
+        beside = unplaced(contents) | (contents.block.frames.keys() if contents.block.metric else set())
         # In frames of their own it is not known of images without adjusted pose to which group they belong.
         known = {} if beside and not contents.block.metric else contents.block.poses
         positions = {i: pose.center_m for i, pose in known.items() if i not in beside}
@@ -72,11 +73,12 @@ def camera_fields(contents: ExportContents, solution: Solution, links: Links) ->
 def footprint_fields(
     contents: ExportContents, solution: Solution, links: Links
 ) -> list[tuple[Footprint, dict[str, Any]]]:
-    """Footprints and their attributes, by image_id, of images that have a place."""
+    """Footprints and their attributes, by image_id, of images that have a place: by poses before the adjustment, which
+    of images in frames of their own say nothing of the world."""
     images = {image.image_id: image for image in contents.block.images}
     found = []
     for image_id, footprint in sorted(block_footprints(contents.block).items()):
-        if image_id not in links.positions:
+        if image_id not in links.positions or (contents.block.metric and image_id in contents.block.frames):
             continue
         image = images[image_id]
         fields = {

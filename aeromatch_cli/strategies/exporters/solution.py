@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray
+from aeromatch_cli.data import AdjustedBlock, Block, Camera, FloatArray, Image, IntArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.geometry.lenses import Nearest
@@ -32,31 +32,37 @@ class Solution:
 
     @classmethod
     def of(cls, contents: ExportContents) -> Solution:
-        block, adjusted = contents.block, contents.adjusted
-        if adjusted is not None:
-            aside = unplaced(contents)
-            poses = {i: (pose.rotation, pose.center_m) for i, pose in adjusted.poses.items() if i not in aside}
-            return cls(block.images, {**block.cameras, **adjusted.cameras}, poses)
-        given = {i: (p.world_rotation, p.center_m) for i, p in block.poses.items() if p.world_rotation is not None}
-        return cls(block.images, block.cameras, given)
+        block, adjusted, aside = contents.block, contents.adjusted, unplaced(contents)
+        cameras = block.cameras if adjusted is None else {**block.cameras, **adjusted.cameras}
+        known = known_poses(block) if adjusted is None else adjusted_poses(adjusted)
+        return cls(block.images, cameras, {i: pose for i, pose in known.items() if i not in aside})
 
     def camera(self, image: Image) -> Camera:
         return self.cameras[image.camera_id]
 
 
+def known_poses(block: Block) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Poses before adjustment, of all images that have an attitude, each in the frame of its group."""
+    return {i: (p.world_rotation, p.center_m) for i, p in block.poses.items() if p.world_rotation is not None}
+
+
+def adjusted_poses(adjusted: AdjustedBlock) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Poses after adjustment, each in the frame of its group."""
+    return {i: (pose.rotation, pose.center_m) for i, pose in adjusted.poses.items()}
+
+
 def unplaced(contents: ExportContents) -> frozenset[str]:
-    """Images of groups whose place beside the first part of the adjusted block is not known; of a block with a CRS all
-    that no position has placed in it."""
-    if contents.adjusted is None:
-        return frozenset()
-    return contents.adjusted.aside(in_world=contents.geographic is not None)
+    """Images of groups whose place beside the first part of the block is not known, as adjusted or, without adjustment,
+    as oriented; of a block in metres all that no position has placed in its world."""
+    return (contents.adjusted or contents.block).aside(in_world=contents.block.metric)
 
 
 def unplaced_remark(contents: ExportContents) -> list[str]:
     """Return a sentence on the images that `unplaced` names, where a format leaves them out."""
-    if contents.adjusted is None or not (beside := unplaced(contents)):
+    if not (beside := unplaced(contents)):
         return []
-    groups = len({contents.adjusted.frames[image_id] for image_id in beside})
+    frames = (contents.adjusted or contents.block).frames
+    groups = len({frames[image_id] for image_id in beside})
     which = "another group" if groups == 1 else f"{groups} other groups"
     return [
         f"{len(beside)} images of {which}, whose place beside the first is not known, have no pose and no point here: "
