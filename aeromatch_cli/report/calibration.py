@@ -20,10 +20,11 @@ from aeromatch_cli.report.figures import (
     round_length,
     svg,
 )
-from aeromatch_cli.results.adjustment import Calibration, Parameter
+from aeromatch_cli.results.adjustment import Calibration, HeightErrors, Parameter
 from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.sfm.bundle.network import LENS
 from aeromatch_cli.sfm.calibration import camera_of
+from aeromatch_cli.sfm.quality.finding import WHOLE_BLOCK, part_words
 
 # Cells along the longer side of a picture; a mean of fewer residuals shows their noise.
 _CELLS, _FEWEST = 16, 5
@@ -56,8 +57,9 @@ class CameraSection:
 
 @dataclass(frozen=True)
 class HeightsSection:
-    """Expected errors of heights: a map (SVG) and what it means."""
+    """Expected errors of heights of one group: of what, a map (SVG) and what it means."""
 
+    title: str
     plan: str
     words: str
 
@@ -195,11 +197,17 @@ def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, title: s
     return svg(axes.figure, title, "lens", {})
 
 
-def heights_section(found: AdjustResult) -> HeightsSection | None:
-    """Of the largest group whose errors are known."""
-    heights = next((group.heights for group in found.groups if group.heights is not None), None)
-    if heights is None:
-        return None
+def heights_sections(found: AdjustResult, names: Mapping[str, str]) -> list[HeightsSection]:
+    """One of every group whose errors are known. names: of the files, by image_id."""
+    return [
+        _heights_section(group.heights, part_words(group, found.groups, names))
+        for group in found.groups
+        if group.heights is not None
+    ]
+
+
+def _heights_section(heights: HeightErrors, part: str) -> HeightsSection:
+    """part: what these are the errors of, in words."""
     points = np.array(heights.points, dtype=np.float64).reshape(-1, 3)
 
     def length(value: float) -> str:
@@ -208,10 +216,11 @@ def heights_section(found: AdjustResult) -> HeightsSection | None:
 
     words = (
         f"Standard deviations of the heights of {len(points)} points, as measurements and geometry let expect them; "
-        f"median {length(heights.sigma)}. The middle of the block may lie {length(heights.bowl)} above or "
+        f"median {length(heights.sigma)}. The middle of {part} may lie {length(heights.bowl)} above or "
         f"below its border, one side {length(heights.tilt)} above or below the middle."
     )
-    return HeightsSection(_height_map(points, heights.pixel, in_world=heights.metric), words)
+    title = "Expected errors of heights" + ("" if part == WHOLE_BLOCK else f" in {part}")
+    return HeightsSection(title, _height_map(points, heights.pixel, in_world=heights.metric), words)
 
 
 def _height_map(points: FloatArray, pixel: float, *, in_world: bool) -> str:

@@ -35,7 +35,7 @@ from aeromatch_cli.report.adjustment import (
     read_position_residuals,
     surveyed_rows,
 )
-from aeromatch_cli.report.calibration import CameraSection, camera_sections, heights_section
+from aeromatch_cli.report.calibration import CameraSection, camera_sections, heights_sections
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.gathering import Gathered, gather, settled
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
@@ -159,7 +159,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
         ),
         cameras=_cameras(context, adjustment, adjusted),
         readout_not_tried=adjustment.found.readout_not_tried,
-        heights=heights_section(adjustment.found),
+        heights=heights_sections(adjustment.found, {row.image_id: row.name for row in images}),
         residuals=surveyed_rows(control),
         residuals_after_fit=control is not None and control.transformation is not None,
         block=_block_facts(context, in_world=adjustment.in_world),

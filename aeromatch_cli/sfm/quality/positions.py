@@ -64,12 +64,18 @@ def positions(evidence: QualityInput) -> Found:
         "they are less exact than stated, or another focal length, time or antenna offset stands behind it; state "
         "their real accuracy, or correct their cause"
     )
-    for name, axes in (("horizontally", [0, 1]), ("vertically", [2])):
+    for name, axes in (("horizontally", "xy"), ("vertically", "z")):
+        of = ["xyz".index(axis) for axis in axes]
         sigmas, off_m, stated_m = (
-            float(np.sqrt(shares @ [rms(np.array(one)[axes]) ** 2 for one in values]))
+            float(np.sqrt(shares @ [rms(np.array(one)[of]) ** 2 for one in values]))
             for values in zip(*met, strict=True)
         )
-        words = f"positions are met {name} to {plain(off_m, 3)} m, {sigmas:.1f} times the {plain(stated_m, 3)} m stated"
+        # Of x and y together, as in the page's table; what is stated is stated of each.
+        error_m = off_m * np.sqrt(len(of))
+        words = (
+            f"positions are met {name} to {plain(error_m, 3)} m (root mean square in {axes.upper()}), "
+            f"{sigmas:.1f} times what is stated, {plain(stated_m, 3)} m{' along each axis' if len(of) > 1 else ''}"
+        )
         yield finding_of(f"positions {name}", sigmas, _POSITION_SIGMAS, words, with_held(evidence, remedy))
 
 
