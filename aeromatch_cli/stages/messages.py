@@ -80,7 +80,11 @@ def settled_words(found: MatchResult) -> str:
     by, lacking = found.settled_by, found.not_settled
     whole = sum(by.values()) + lacking
     counts = ", ".join(f"{count} by {name}" for name, count in by.items())
-    lack = f"; {lacking} with fewer matches, or less of the overlap covered, than asked for" if lacking else ""
+    lack = (
+        f"; {lacking} with fewer matches, or less of the overlap covered, than the last step asks for"
+        if lacking
+        else ""
+    )
     return f"of {whole} pairs settled: {counts}{lack}"
 
 
