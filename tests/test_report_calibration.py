@@ -66,6 +66,9 @@ def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
     assert float(re.findall(r"up to ([\d.]+) px", moved_words)[0]) == pytest.approx(465.0 * 10 / 700, abs=0.06)
     assert float(re.findall(r"up to ([\d.]+) px", remaining_words)[0]) == pytest.approx(0.5, abs=0.005)
     assert all(drawn.startswith("<svg") for drawn in (moved, remaining))
+    # Names of cameras are long: that of the panel is enough, and the title ends before the arrow of the scale.
+    assert re.search(r">adjusted less known before; arrows enlarged [\d.]+ times<", moved)
+    assert re.search(r">means of residuals; arrows enlarged [\d.]+ times<", remaining)
 
 
 def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() -> None:

@@ -137,9 +137,7 @@ def _moved(parameters: Mapping[str, Parameter], camera: Camera, camera_id: str) 
         f"What the calibration does: where the adjusted camera puts image points, against the camera known before "
         f"(focal length, principal point and distortion together); up to {longest:.1f} px."
     )
-    return _arrows(
-        camera, places[known], moved_px[known], f"camera {camera_id}, adjusted less known before", "moved"
-    ), words
+    return _arrows(camera, places[known], moved_px[known], camera_id, "adjusted less known before", "moved"), words
 
 
 def _remaining(
@@ -171,10 +169,11 @@ def _remaining(
         f"What remains: means of the residuals of image points, measured less adjusted, in cells of {cell_px:.0f} px; "
         f"up to {largest:.2f} px. Arrows without order are noise; a pattern is distortion that the camera model lacks."
     )
-    return _arrows(camera, places, means_px, f"camera {camera_id}, means of residuals", "remaining"), words
+    return _arrows(camera, places, means_px, camera_id, "means of residuals", "remaining"), words
 
 
-def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, title: str, css: str) -> str:
+def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, camera_id: str, title: str, css: str) -> str:
+    """An arrow at every place (N, 2) of a picture. The camera, whose name may be long, is named above the figure."""
     left, right, bottom, top = _FIELD_EDGES_IN
     height = (_FIELD_IN - left - right) * camera.height_px / camera.width_px + bottom + top
     margins = {
@@ -194,7 +193,7 @@ def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, title: s
     shown = round_length(usual)
     axes.quiverkey(arrows, 0.86, 1.045, enlarged * shown, f"{shown:g} px", labelpos="E", color=COLOURS["accent"])
     axes.set_title(f"{title}; arrows enlarged {enlarged:.3g} times", fontsize=10, loc="left")
-    return svg(axes.figure, title, "lens", {})
+    return svg(axes.figure, f"camera {camera_id}, {title}", "lens", {})
 
 
 def heights_sections(found: AdjustResult, names: Mapping[str, str]) -> list[HeightsSection]:

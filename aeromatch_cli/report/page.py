@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -45,6 +46,7 @@ from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
 from aeromatch_cli.report.residuals import residual_section
 from aeromatch_cli.report.rows import (
     NOT_JUDGED,
+    OWN_FRAME,
     ImageRow,
     PairRow,
     evaluation_figures,
@@ -77,7 +79,11 @@ def run(context: Context) -> StageReport:
     adjustment = read_adjustment(context)
     adjusted = final_points(context, adjustment)
     shown = as_adjusted(context.block, adjusted, in_world=adjustment.in_world)
-    found = gather(context, pair_table, adjustment.judged.spread, {**shown.poses, **adjusted_poses(adjusted)})
+    poses = {**shown.poses, **adjusted_poses(adjusted)}
+    own_frame = frozenset[str]() if adjusted is None else adjusted.aside(in_world=True)
+    found = gather(
+        context, pair_table, adjustment.judged.spread, poses, own_frame if adjustment.in_world else poses.keys()
+    )
     with settled():
         page = render(context, found, adjustment, adjusted)
     write_text(context.workspace.report, page)
@@ -240,13 +246,17 @@ def _headline(
     images: Sequence[ImageRow], pairs: Sequence[PairRow], links: FilterResult, failures: Sequence[Any]
 ) -> list[tuple[str, str, str]]:
     """(number, words, level) of each tile; level "", "warn" or "bad"."""
-    posed = sum(row.pose != "none" for row in images)
-    full = sum(row.pose == "full" for row in images)
+    poses = Counter(row.pose for row in images)
+    own_frame = f"; {poses[OWN_FRAME]:,} oriented in a frame of their own" if poses[OWN_FRAME] else ""
     verified = sum(row.state == "verified" for row in pairs)
     matches, parts, weak = links.verified_matches, len(links.components), len(links.weakly_tied)
     tiles = [
         (counted(len(images), "image", "images"), False),
-        (f"{posed:,} with position, {full:,} with attitude, given or found", False),
+        (
+            f"{poses['full'] + poses['position']:,} with position, {poses['full']:,} with attitude, given or found"
+            + own_frame,
+            False,
+        ),
         (counted(len(pairs), "pair compared", "pairs compared"), False),
         (counted(verified, "verified pair", "verified pairs"), not verified),
         (counted(matches, "verified match", "verified matches"), not matches),

@@ -34,6 +34,8 @@ from aeromatch_cli.store.naming import item_named
 from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"
+# Of a pose that lies in a frame which nothing ties to the world.
+OWN_FRAME = "own frame"
 _UNENHANCED = "images not enhanced (same illumination)"
 
 
@@ -71,11 +73,11 @@ class PairRow:
 class ImageRow:
     """One image. href: relative link to the picture, or "". keypoints, coverage: None where there are no features.
 
-    pose: "full", "position" or "none". coverage: share of the image's cells that hold a verified match. views: virtual
-    views that its features come from, None where none are on file. shadow: share of the picture that the enhancement
-    treated as shadow, None where it looks for none. ninths: how many of the image (3 x 3) hold a point of the adjusted
-    block, empty_ninths: how many hold none though other images show them, points_of_three: its points that three and
-    more images see; None where it is not adjusted.
+    pose: "full", "position", "own frame" (one that nothing ties to the world) or "none". coverage: share of the image's
+    cells that hold a verified match. views: virtual views that its features come from, None where none are on file.
+    shadow: share of the picture that the enhancement treated as shadow, None where it looks for none. ninths: how many
+    of the image (3 x 3) hold a point of the adjusted block, empty_ninths: how many hold none though other images show
+    them, points_of_three: its points that three and more images see; None where it is not adjusted.
     """
 
     image_id: str
