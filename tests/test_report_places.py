@@ -84,7 +84,7 @@ def test_points_of_other_groups_are_not_counted_beside_the_first() -> None:
 def test_points_are_counted_by_the_images_that_see_them_and_by_their_error() -> None:
     tracks = {name: np.array([[0, 0], [1, 1]]) for name in "abc"} | {"d": np.array([[0, 0]])}
     found = point_figures(block(np.zeros((2, 3)), tracks, np.array([0.2, 0.4])))
-    assert "4 images: 1 points<" in found[1]
-    assert "3 images: 1 points<" in found[1]
-    assert sum(int(n) for n in re.findall(r"px: (\d+) points", found[0])) == 2
+    assert "4 images: 1 point<" in found[1]
+    assert "3 images: 1 point<" in found[1]
+    assert sum(int(n) for n in re.findall(r"px: (\d+) points?", found[0])) == 2
     assert point_figures(None) == []

@@ -10,6 +10,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray
 from aeromatch_cli.report.figures import COLOURS, histogram_axes, label_width, name_ground_axes, new_axes, svg
+from aeromatch_cli.words import form
 
 # Cells along the longer side of the ground, of the overlap count; and of the points, as many as their number allows.
 _FINE, _COARSE = 160, (6, 40)
@@ -105,7 +106,7 @@ def _points_figure(ground: Ground, footprints: Sequence[FloatArray], points_m: F
         f"{_FEW_POINTS} points ({share:.0f} %)."
     )
     if beyond := len(points_m) - int(points.sum()):
-        words += f" {beyond:,} of {len(points_m):,} points {'lies' if beyond == 1 else 'lie'} beyond the drawing."
+        words += f" {beyond:,} of {len(points_m):,} points {form(beyond, 'lies', 'lie')} beyond the drawing."
     return _field(ground, points, points > 0, label, weak), words
 
 
@@ -169,7 +170,9 @@ def _images_figure(seen: IntArray) -> str:
     axes.set(xlabel=label, ylabel="points", xticks=range(int(numbers[0]), int(numbers[-1]) + 1))
     axes.grid(visible=False, axis="x")
     axes.yaxis.set_major_formatter("{x:,.0f}")
-    titles = [f"{number} images: {count:,} points" for number, count in zip(numbers, counts, strict=True)]
+    titles = [
+        f"{number} images: {count:,} {form(count, 'point')}" for number, count in zip(numbers, counts, strict=True)
+    ]
     return svg(axes.figure, "images that see a point", "histogram", {"bar": titles})
 
 
@@ -189,7 +192,7 @@ def _errors_figure(errors_px: FloatArray) -> str:
     axes.grid(visible=False, axis="x")
     axes.yaxis.set_major_formatter("{x:,.0f}")
     titles = [
-        f"{low:.2f} to {high:.2f} px: {count:,} points"
+        f"{low:.2f} to {high:.2f} px: {count:,} {form(count, 'point')}"
         for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True)
     ]
     return svg(axes.figure, "reprojection errors", "histogram", {"bar": titles})
