@@ -379,6 +379,9 @@ def test_steps_that_match_makes_are_no_longer_left_out(site: Site, monkeypatch: 
     made = invoke("match", "--workspace", site.work, "--json")
     assert made.facts["stages"]["match"]["result"]["settled_by"].keys() == {"first", "guided"}
     assert "left_out" not in invoke("show", site.work, "--json").facts
+    assert "next      10 pairs are not verified with these matches: `aeromatch filter` does that" in made.stdout
+    assert invoke("filter", "--workspace", site.work).code == 0
+    assert "not verified with" not in invoke("match", "--workspace", site.work).stdout
 
 
 @pytest.mark.slow

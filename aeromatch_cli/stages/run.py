@@ -49,6 +49,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.stages.within import (
     Deadline,
     fitting,
@@ -266,11 +267,20 @@ def _attempt(asked: _Asked) -> Result:
         )
     names = {image.image_id: image.name for image in context.block.images}
     failures = all_failures(command, context, reports)
+    unjudged = _unjudged(context) if command == "match" else 0
     old_page = command in JUDGED and report.is_of_earlier_results(context.workspace)
     return command_result(
         command, context.settings, context.workspace, names, reports, failures, said,
-        part=context.scope.shard is not None, old_page=old_page,
+        part=context.scope.shard is not None, old_page=old_page, unjudged=unjudged,
     )  # fmt: skip
+
+
+def _unjudged(context: Context) -> int:
+    """Count the pairs with matches that are not verified with these; of a shard nothing is said."""
+    if context.scope.shard is not None:
+        return 0
+    state = BlockState.of(context)
+    return sum(state.are_matched(pair) for pair in state.outdated_pairs())
 
 
 def _timed(result: Result, deadline: Deadline | None) -> Result:
