@@ -118,6 +118,7 @@ def test_a_run_without_positions_says_no_metre(site: Site) -> None:
     assert stages["adjust"]["result"]["sigma_position_m"] is None
     assert lengths(stages) == {"origin_m"}  # of a frame that has none
     (group,) = stages["adjust"]["result"]["groups"]
+    assert group["first_image"] == site.names()[0]
     assert 0.0 < group["heights"]["sigma"] / group["heights"]["pixel"] < 10.0
     oriented = stages["adjust"]["result"]["images"]
     assert f"images      {IMAGES}, 0 with position given; {oriented} oriented\n" in invoke("show", site.work).stdout

@@ -144,7 +144,7 @@ def test_a_cascade_ends_in_one_result(site: Site) -> None:
     outcome = site("run", *settings)
     assert outcome.code == 0, outcome.stderr
     pairs = IMAGES * (IMAGES - 1) // 2
-    lacking = f"{pairs} with fewer matches, or less of the overlap covered, than asked for"
+    lacking = f"{pairs} with fewer matches, or less of the overlap covered, than the last step asks for"
     assert f"of {pairs} pairs settled: 0 by first, 0 by learned; {lacking}" in outcome.stdout
     with (site.work / "steps.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))

@@ -328,7 +328,7 @@ def test_points_whose_name_says_that_they_are_check_points(tmp_path: Path) -> No
     text = f"EPSG:32633\n{X} {Y} 34 10 20 a.jpg p1\n{X} {Y} 35 30 20 a.jpg CHK-p2\n"
     found = read_survey(written(tmp_path, text, "gcp_list.txt"), None)
     assert [(point.name, point.check) for point in found.points] == [("p1", False), ("CHK-p2", True)]
-    assert found.remarks == ("gcp_list.txt: 1 points are check points by their name (CHK-...)",)
+    assert found.remarks == ("gcp_list.txt: 1 point is a check point by name (CHK-...)",)
 
 
 def test_heights_that_are_all_zero_are_named(tmp_path: Path) -> None:

@@ -213,6 +213,13 @@ def test_list_has_every_preset_and_strategy() -> None:
     for starred in ("nearest", "epipolar", "learned"):
         assert any(line.startswith(f"  {starred} *") for line in lines)
     assert not any(line.startswith("  poselib *") for line in lines)
+    matchers = {one["name"]: one["words"] for one in invoke("list", "match", "--json").facts["families"]["match"]}
+    for name, features in (("lightglue", "sift"), ("lightglue-learned", "learned")):
+        assert matchers[name].startswith("LightGlue, a network")
+        assert f"`extract={features}`" in matchers[name]
+    every = [one for family in invoke("list", "--json").facts["families"].values() for one in family]
+    # Each line says what a strategy is or does, and not only what it is of.
+    assert not [one for one in every if one["words"].split()[0] in ("Of", "For", "With") or len(one["words"]) < 25]
     filters = invoke("list", "filter", "--json").facts["families"]["filter"]
     assert [one["name"] for one in filters if one["default"]] == ["epipolar"]
     assert invoke("list", "matcher").code == 2

@@ -153,6 +153,26 @@ def test_image_without_position_gets_neighbours_by_name_and_time() -> None:
     assert {p.reason for p in untimed if "i003b" in (p.image_id0, p.image_id1)} == {"name"}
 
 
+def test_images_of_different_places_are_not_paired_by_position() -> None:
+    poses: dict[str, Pose | None] = {f"a{n}": pose(10.0 * n, 0.0, None) for n in range(3)}
+    poses |= {f"b{n}": pose(10.0 * n, 60_000.0, None) for n in range(3)}
+    pairs = Overlap()(block(poses))
+    assert {pair.reason for pair in pairs} == {"position"}
+    within = [("a0", "a1"), ("a0", "a2"), ("a1", "a2"), ("b0", "b1"), ("b0", "b2"), ("b1", "b2")]
+    assert keys(pairs) == within
+    near = {i: p if p is None or i[0] == "a" else pose(p.center_m[0], 40_000.0, None) for i, p in poses.items()}
+    assert len(Overlap()(block(near))) == 15
+    arbitrary = Overlap()(replace(block(poses), metric=False))  # whose lengths say nothing
+    assert len(arbitrary) == 15
+
+
+def test_image_that_lies_apart_from_all_others_is_paired_by_name() -> None:
+    poses = strip(4, 25.0) | {"i001b": pose(0.0, 900_000.0, None)}
+    pairs = Overlap(fallback_neighbours=2)(block(poses))
+    new = {(p.image_id0, p.image_id1): p.reason for p in pairs if "i001b" in (p.image_id0, p.image_id1)}
+    assert new == {("i001", "i001b"): "name", ("i001b", "i002"): "name"}
+
+
 def test_nothing_known_at_all_is_paired_by_name() -> None:
     pairs = Overlap(fallback_neighbours=4)(block({f"i{n}": None for n in range(5)}))
     assert len(pairs) == 4 + 3

@@ -289,3 +289,37 @@ def test_flights_of_a_camera_with_calibrations_of_their_own_are_named() -> None:
     assert fault.level == "doubtful"
     assert "has another calibration in flight B (6 images)" in fault.sentence
     assert "f by +12.0 px, cx by -3.0 px, cy by +0.0 px" in fault.sentence
+
+
+def test_parts_of_equal_size_are_told_apart_by_an_image() -> None:
+    first = deepcopy(GROUP) | {"images": 6, "first_image": "a"}
+    second = first | heights(bowl=0.453, tilt=5.0, sigma=0.9) | {"first_image": "b"}
+    quality = judged_with(adjust={"groups": [first, second]}, names={"a": "DJI_1.JPG", "b": "IMG_7.JPG"})
+    part = "the part of 6 images with IMG_7.JPG"
+    assert f"the middle of {part} may lie 15.1 ground pixels (0.45 m)" in found(quality, "bowl").sentence
+    assert found(quality, "tilt").sentence.startswith(f"{part} may be tilted by 2.86 degrees")
+    assert f"heights of {part} are exact to 30.0 ground pixels" in found(quality, "heights").sentence
+    # Of a result by an earlier version no image is known.
+    quality = judged_with(adjust={"groups": [first, second | {"first_image": ""}]})
+    assert "the middle of the part of 6 images may lie" in found(quality, "bowl").sentence
+
+
+def test_measured_angles_are_no_remedy_where_there_are_some() -> None:
+    tilted = heights(tilt=5.0)
+    assert "measured angles" not in found(judged_with(group=tilted), "tilt").sentence
+    assert "measured angles" in found(judged_with(group=tilted, adjust={"residuals": None}), "tilt").sentence
+
+
+def test_errors_of_positions_are_those_of_the_table() -> None:
+    # x 0.117, y 0.447, z 0.165 m: XY 0.462 m.
+    off = positions(rms_m=[0.117, 0.447, 0.165], rms_sigmas=[0.0234, 0.0894, 0.033], stated_m=[5.0, 5.0, 5.0])
+    quality = judged_with(group=off)
+    across, up = (found(quality, f"positions {name}") for name in ("horizontally", "vertically"))
+    assert across.value == pytest.approx(0.0654, abs=1e-4)  # root mean square of both axes, as before
+    assert across.sentence == (
+        "positions are met horizontally to 0.462 m (root mean square in XY), 0.1 times what is stated, "
+        "5 m along each axis"
+    )
+    assert (
+        up.sentence == "positions are met vertically to 0.165 m (root mean square in Z), 0.0 times what is stated, 5 m"
+    )

@@ -303,7 +303,14 @@ def test_images_of_other_groups_have_no_place_on_the_map(full, frames, in_world,
     tracks = {i: np.column_stack([np.arange(30), np.arange(30) + 30 * (i == "c")]).astype(np.int32) for i in "abc"}
     points_m = np.zeros((60, 3))
     adjusted = AdjustedBlock(full.block.cameras, poses, points_m, np.zeros(60), tracks, frames)
-    page = report.render(full, gather(full, pair_table), Adjustment(in_world=in_world), adjusted)
+    own_frame = adjusted.aside(in_world=True) if in_world else full.block.poses.keys()
+    found = gather(full, pair_table, own_frame=own_frame)
+    page = report.render(full, found, Adjustment(in_world=in_world), adjusted)
+    tile = "3 with position, 3 with attitude, given or found; 1 oriented in a frame of their own"
+    if not in_world:
+        tile = "0 with position, 0 with attitude, given or found; 4 oriented in a frame of their own"
+    assert tile in Structure.of(page).words()
+    assert row_with(page, "image-table", "a.png")[1] == ("full" if in_world else "own frame")
     assert "Not drawn: 1 image of other groups, whose place beside the first is not known." in page
     (block_map,) = (svg for svg in re.findall(r"<svg.*?</svg>", page, re.S) if 'aria-label="Block map"' in svg)
     cameras = [title for kind in ("fine", "weak", "wrong") for title, _ in shapes(block_map, kind)]
@@ -311,6 +318,19 @@ def test_images_of_other_groups_have_no_place_on_the_map(full, frames, in_world,
     assert sorted(title.split(": ")[0] for title in cameras) == sorted(names[i] for i in shown)
     assert ("metres" in block_map, "arbitrary units" in block_map) == (in_world, not in_world)
     assert "The other groups of images are left out." in page
+
+
+def test_the_guide_names_the_parts_of_the_page_in_their_order(full):
+    nav = re.findall(
+        r'<a href="#\w+">(.*?)</a>',
+        (Path(__file__).parents[1] / "aeromatch_cli" / "report" / "page.html.jinja").read_text(encoding="utf-8"),
+    )
+    guide = (Path(__file__).parents[1] / "docs" / "guide.md").read_text(encoding="utf-8")
+    bullets = guide[guide.index("From the top:") : guide.index("### Good, doubtful, bad")]
+    named = [words.lower() for words in re.findall(r"\*\*(.*?)\*\*", bullets)]
+    places = [next(k for k, words in enumerate(named) if label.lower() in words) for label in nav]
+    assert len(nav) == 12
+    assert places == sorted(places), [named[k] for k in places]
 
 
 def test_previews_are_best_worst_and_rejected_and_missing_files_are_noted(full):

@@ -12,7 +12,7 @@ from make_results import filled
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.report.adjustment import surveyed_rows
-from aeromatch_cli.report.calibration import camera_sections, heights_section
+from aeromatch_cli.report.calibration import camera_sections, heights_sections
 from aeromatch_cli.results.adjustment import Control
 from aeromatch_cli.results.stages import AdjustResult
 
@@ -66,20 +66,32 @@ def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
     assert float(re.findall(r"up to ([\d.]+) px", moved_words)[0]) == pytest.approx(465.0 * 10 / 700, abs=0.06)
     assert float(re.findall(r"up to ([\d.]+) px", remaining_words)[0]) == pytest.approx(0.5, abs=0.005)
     assert all(drawn.startswith("<svg") for drawn in (moved, remaining))
+    # Names of cameras are long: that of the panel is enough, and the title ends before the arrow of the scale.
+    assert re.search(r">adjusted less known before; arrows enlarged [\d.]+ times<", moved)
+    assert re.search(r">means of residuals; arrows enlarged [\d.]+ times<", remaining)
 
 
 def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() -> None:
     [group] = ADJUSTED["groups"]
     in_own = {"heights": group["heights"] | {"metric": False}}
-    world, own = (heights_section(filled(AdjustResult, groups=[one])) for one in (group, in_own))
-    assert world is not None
-    assert own is not None
+    [world], [own] = (heights_sections(filled(AdjustResult, groups=[one]), {}) for one in (group, in_own))
+    assert world.title == "Expected errors of heights"
     assert "median 0.150 m (1.5 ground pixels)" in world.words
     assert "may lie 0.400 m (4.0 ground pixels) above or below its border" in world.words
     assert "median 1.5 ground pixels" in own.words
     assert "metres" in world.plan
     assert "metres" not in own.plan
-    assert heights_section(AdjustResult(images=0)) is None
+    assert heights_sections(AdjustResult(images=0), {}) == []
+
+
+def test_expected_errors_of_heights_are_shown_of_every_part_by_name() -> None:
+    [group] = ADJUSTED["groups"]
+    groups = [group | {"images": 3, "first_image": i} for i in ("a", "b")]
+    groups[1] |= {"heights": group["heights"] | {"metric": False, "bowl": 1.51}}
+    first, second = heights_sections(filled(AdjustResult, groups=groups), {"a": "a.jpg", "b": "b.jpg"})
+    assert first.title == "Expected errors of heights in the part of 3 images with a.jpg"
+    assert "The middle of the part of 3 images with a.jpg may lie 0.400 m (4.0 ground pixels)" in first.words
+    assert "The middle of the part of 3 images with b.jpg may lie 15.1 ground pixels" in second.words
 
 
 def test_surveyed_points_have_metres_pixels_and_sigmas() -> None:

@@ -29,6 +29,20 @@ def test_overlap_counts_are_those_of_the_footprints() -> None:
     assert (whole[2, 10], whole[18, 10]) == (2, 3)  # row 0 lies in the south
 
 
+def test_whole_footprints_are_drawn_but_for_views_far_beyond_the_cameras() -> None:
+    centers = np.array([[0.0, 0.0], [100.0, 0.0]])
+    forward = SQUARE + 0.8 * EAST  # all that it shows lies north of the cameras
+    ground = Ground.of(centers, [forward, SQUARE + EAST + 0.5 * NORTH])
+    assert (*ground.low_m, *ground.high_m, ground.cut) == (0.0, 0.0, 150.0, 130.0, False)
+    horizon = np.array([[0.0, 0.0], [900.0, 0.0], [900.0, 5000.0]])
+    ground = Ground.of(centers, [SQUARE, SQUARE, SQUARE, horizon])
+    assert (*ground.low_m, *ground.high_m, ground.cut) == (0.0, 0.0, 250.0, 150.0, True)  # 1.5 times 100 m beyond
+    points = np.concatenate([np.full((40, 3), 50.0), [[50.0, 4000.0, 0.0]]])
+    found = ground_figures(centers, [SQUARE, SQUARE, SQUARE, horizon], block(points, {}, np.zeros(41)))
+    assert all("Ground more than 1.5 footprints beyond the cameras is not drawn." in words for _, words in found)
+    assert "1 of 41 points lies beyond the drawing." in found[1][1]
+
+
 def test_places_that_lack_points_are_counted() -> None:
     """Three footprints show the same square; points lie in its western half alone."""
     rng = np.random.default_rng(3)
@@ -70,7 +84,7 @@ def test_points_of_other_groups_are_not_counted_beside_the_first() -> None:
 def test_points_are_counted_by_the_images_that_see_them_and_by_their_error() -> None:
     tracks = {name: np.array([[0, 0], [1, 1]]) for name in "abc"} | {"d": np.array([[0, 0]])}
     found = point_figures(block(np.zeros((2, 3)), tracks, np.array([0.2, 0.4])))
-    assert "4 images: 1 points<" in found[1]
-    assert "3 images: 1 points<" in found[1]
-    assert sum(int(n) for n in re.findall(r"px: (\d+) points", found[0])) == 2
+    assert "4 images: 1 point<" in found[1]
+    assert "3 images: 1 point<" in found[1]
+    assert sum(int(n) for n in re.findall(r"px: (\d+) points?", found[0])) == 2
     assert point_figures(None) == []

@@ -75,6 +75,8 @@ NULL_ISLAND = centers()
 NULL_ISLAND[4, :2] = -np.array(ORIGIN[:2])
 FAR = centers()
 FAR[5, 0] += 1.2e6
+PLACES = centers()
+PLACES[3:, 1] += 60_000.0
 LOW = centers(z=122.0)
 HIGH = centers(z=12120.0 + np.arange(6))
 TILTED = [from_omega_phi_kappa(2.0, 1.0, 10.0 * i) for i in range(6)]
@@ -87,7 +89,11 @@ TILTED = [from_omega_phi_kappa(2.0, 1.0, 10.0 * i) for i in range(6)]
         (block(RELATIVE), ["relative to the take-off point", "98 to 102 m", "6 images", "--ground"]),
         (block(centers(z=6.0), ground_z_m=-58.0), ["ground lies at -58 m", "take-off point, or from the ellipsoid"]),
         (block(NULL_ISLAND), ["1 image (flight/img4.jpg)", "latitude 0, longitude 0"]),
-        (block(FAR), ["spread over 1,2", "1 image (flight/img5.jpg)", "--crs"]),
+        (block(FAR), ["lie in 2 places 1,200 km apart", "...); 1 image (flight/img5.jpg).", "--crs"]),
+        (
+            block(PLACES),
+            ["lie in 2 places 60 km apart", "3 images (flight/img0.jpg, flight/img1.jpg, flight/img2.jpg); 3"],
+        ),
         (block(centers(x=0.0, y=0.0)), ["all 6 positions are identical"]),
         (block(LOW), ["6 images", "2.0 to 2.0 m above ground"]),
         (block(HIGH), ["6 images", "12,000.0 to 12,005.0 m above ground"]),
@@ -105,6 +111,7 @@ TILTED = [from_omega_phi_kappa(2.0, 1.0, 10.0 * i) for i in range(6)]
         "low ground",
         "null island",
         "far away",
+        "two places",
         "identical",
         "low",
         "high",
@@ -119,6 +126,15 @@ def test_each_oddity_gives_exactly_its_warning(case: Block, words: list[str]) ->
     assert len(warnings) == 1, warnings
     for word in words:
         assert word in warnings[0]
+
+
+def test_far_positions_are_one_place_where_others_lie_between() -> None:
+    far = centers()
+    far[:, 0] = 40_000.0 * np.arange(6)
+    assert summarise(block(far)).warnings == ()
+    far[3:, 0] += 20_000.0
+    (warning,) = summarise(block(far)).warnings
+    assert "lie in 2 places 140 km apart" in warning  # from 40 to 180 km
 
 
 def test_ground_below_sea_level_is_not_odd_where_all_images_fly_below_it() -> None:

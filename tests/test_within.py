@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -81,6 +85,17 @@ def test_one_rule_says_what_fits() -> None:
         "130 s", "2 min"
     )
     assert not late.is_kept
+
+
+def test_the_time_counts_from_the_start_of_the_process(done_site: Site) -> None:
+    began_s = time.monotonic()
+    slow_start = "import time, aeromatch_cli; time.sleep(5); from aeromatch_cli.cli import main; main()"
+    command = [sys.executable, "-c", slow_start, "run", str(done_site.work / "config.yaml"), "--within", "1h"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    taken_s = time.monotonic() - began_s
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("within")]
+    said_s = float(re.findall(r"ended after (\d+) s", line)[0])
+    assert 5.0 <= said_s <= taken_s + 0.5
 
 
 def _tried(image_s: float, pair_s: float, keypoints: float = 4000.0) -> TriedPair:
@@ -346,7 +361,7 @@ def test_a_step_that_does_not_fit_is_left_out_alone(site: Site, monkeypatch: pyt
     tried = _slow_step(monkeypatch, [3600.0])
     outcome = site("run", "--within", "1h", *STEP)
     (left_out,) = outcome.facts["left_out"]
-    assert left_out == "without the step guided, which 10 pairs would have taken"
+    assert left_out == "without the step guided, which 10 pairs would have taken by its limit (below_matches 100000)"
     assert outcome.facts["stages"]["match"]["result"]["settled_by"].keys() == {"first"}
     assert outcome.facts["stages"]["refine"]["done"] > 0
     assert len(tried) == 1
@@ -354,6 +369,19 @@ def test_a_step_that_does_not_fit_is_left_out_alone(site: Site, monkeypatch: pyt
     assert site("run", *STEP).facts["stages"]["match"]["result"]["settled_by"].keys() == {"first", "guided"}
     outcome = site("run", "--within", "1h", "--set", "refine.max_shift_px=2.5", *STEP)
     assert (outcome.facts["left_out"], len(tried)) == ([], 1)
+
+
+@pytest.mark.slow
+def test_steps_that_match_makes_are_no_longer_left_out(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    _slow_step(monkeypatch, [3600.0])
+    assert len(site("run", "--within", "1h", *STEP).facts["left_out"]) == 1
+    assert "without the step guided" in invoke("show", site.work).stdout
+    made = invoke("match", "--workspace", site.work, "--json")
+    assert made.facts["stages"]["match"]["result"]["settled_by"].keys() == {"first", "guided"}
+    assert "left_out" not in invoke("show", site.work, "--json").facts
+    assert "next      10 pairs are not verified with these matches: `aeromatch filter` does that" in made.stdout
+    assert invoke("filter", "--workspace", site.work).code == 0
+    assert "not verified with" not in invoke("match", "--workspace", site.work).stdout
 
 
 @pytest.mark.slow
@@ -377,7 +405,10 @@ def test_a_step_without_time_is_not_tried(site: Site, monkeypatch: pytest.Monkey
     monkeypatch.setattr(Deadline, "holds", lambda self, more_s: more_s < 3000.0)
     monkeypatch.setattr(within, "_later_s", lambda *_: 3000.0)
     outcome = site("run", "--within", "1h", *STEP)
-    assert outcome.facts["left_out"][0] == "without the step guided, which 10 pairs would have taken"
+    assert (
+        outcome.facts["left_out"][0]
+        == "without the step guided, which 10 pairs would have taken by its limit (below_matches 100000)"
+    )
     assert tried == []
     once = iter([True])
     monkeypatch.setattr(Deadline, "holds", lambda self, more_s: next(once, False))

@@ -16,14 +16,14 @@ from aeromatch_cli.geometry.footprints import (
     degenerate_words,
     sees_horizon,
 )
+from aeromatch_cli.geometry.places import place_labels
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, from_yaw_pitch_roll, rotation_z
 
 # Image names (N,) as an array, so that masks select them.
 Names = NDArray[np.object_]
 
-_NAMES_SHOWN = 3
+_NAMES_SHOWN = _PLACES_SHOWN = 3
 _LOWEST_HEIGHT_M, _HIGHEST_HEIGHT_M = 5.0, 10_000.0
-_LARGEST_SPREAD_M = 1_000_000.0
 _NULL_ISLAND_DEG = 0.01
 # Dry land lies hardly below sea level: a ground this low below images that fly above 0 most likely means altitudes
 # above the take-off point, or above the ellipsoid, which lies up to 106 m above sea level.
@@ -63,19 +63,30 @@ def _position_warnings(block: Block, names: Names, centers: FloatArray) -> list[
         )
     rest = centers[~null_island, :2]
     if len(rest) >= 2 and block.metric:
-        spread = float(np.hypot(*np.ptp(rest, axis=0)))
-        if spread < 1e-3:
+        if float(np.hypot(*np.ptp(rest, axis=0))) < 1e-3:
             found.append(
                 f"all {len(rest)} positions are identical: the position of the project or take-off point instead of "
                 "each image's? Give the projection centres, or --poses none"
             )
-        elif spread > _LARGEST_SPREAD_M:
-            far = np.linalg.norm(centers[:, :2] - np.median(rest, axis=0), axis=1) > 0.5 * _LARGEST_SPREAD_M
-            found.append(
-                f"the positions spread over {spread / 1000.0:,.0f} km, {_some(names[far & ~null_island])} far from the "
-                "rest: check exchanged coordinates (x and y, lat and lon) and --crs"
-            )
+        found += _places_warning(names[~null_island], rest)
     return found
+
+
+def _places_warning(names: Names, positions_m: FloatArray) -> list[str]:
+    """Where images (N,) at positions (N, 2) lie in several places, and how far these are from each other."""
+    labels = place_labels(positions_m)
+    count = int(labels.max()) + 1
+    if count == 1:
+        return []
+    middles_m = np.array([np.median(positions_m[labels == n], axis=0) for n in range(count)])
+    farthest_km = max(float(np.linalg.norm(middles_m - middle, axis=1).max()) for middle in middles_m) / 1000.0
+    shown = "; ".join(_some(names[labels == n]) for n in range(min(count, _PLACES_SHOWN)))
+    more, up_to = ("; ..." if count > _PLACES_SHOWN else ""), ("up to " if count > 2 else "")
+    return [
+        f"the positions lie in {count} places {up_to}{farthest_km:,.0f} km apart: {shown}{more}. "
+        "Images of different places show no common ground and are not paired by position: run each place by itself; "
+        "if all are of one flight, check exchanged coordinates (x and y, lat and lon) and --crs"
+    ]
 
 
 def _at_null_island(block: Block, centers: FloatArray) -> BoolArray:

@@ -11,12 +11,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from aeromatch_cli import __version__
+from aeromatch_cli import LOADED_S, __version__
 from aeromatch_cli.cli.commands import EXAMPLES, WEIGHTS, evaluate, frames, synth
 from aeromatch_cli.cli.look_commands import EXAMPLES as LOOK_EXAMPLES
 from aeromatch_cli.cli.look_commands import LOOK
 from aeromatch_cli.cli.options import GroupedHelp
-from aeromatch_cli.cli.output import ARGUMENTS, as_epilog
+from aeromatch_cli.cli.output import ARGUMENTS, STARTED, as_epilog
 from aeromatch_cli.cli.stage_commands import COMMAND_HELP, stage_command
 from aeromatch_cli.errors import ConfigError
 
@@ -43,7 +43,7 @@ class _Commands(TyperGroup):
         """Keeps the arguments as they were written, for the log file."""
         written = list(args)  # parsing uses them up
         _refuse_empty(written)
-        options["obj"] = {ARGUMENTS: written}
+        options["obj"] = {**(options.get("obj") or {}), ARGUMENTS: written}
         return super().make_context(info_name, args, *rest, **options)
 
 
@@ -120,4 +120,4 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal's encoding lacks is no error
-    app()
+    app(obj={STARTED: LOADED_S})

@@ -30,6 +30,8 @@ EXIT_DOUBTFUL = 4
 EXIT_INTERRUPTED = 130
 # Where the application keeps the arguments as they were written, in the object of the root context.
 ARGUMENTS = "aeromatch.arguments"
+# And when its process began, on the clock of time.monotonic(); absent where a command is called in another program.
+STARTED = "aeromatch.started"
 _FAILURES_SHOWN = 5
 _LONGEST_WORD = 1000
 LOGGER = "aeromatch"

@@ -42,7 +42,7 @@ from aeromatch_cli.cli.options import (
     Within,
     WorkspaceDir,
 )
-from aeromatch_cli.cli.output import as_texts, guarded, said
+from aeromatch_cli.cli.output import STARTED, as_texts, guarded, said
 from aeromatch_cli.cli.progress import ProgressKind, progress_shown
 from aeromatch_cli.errors import ConfigError
 
@@ -221,7 +221,10 @@ def stage_command(name: str) -> Callable[..., None]:
             _check_control(block, settings.block)
             course = graph.course(shard=shard is not None) if name == "run" else ()
             shown = progress_shown(progress, quiet=quiet, stages=course)
-            return execute(name, settings, shard=shard, within=within, overwrite=overwrite, progress=shown, say=say)
+            return execute(
+                name, settings, shard=shard, within=within, started=context.find_root().obj.get(STARTED),
+                overwrite=overwrite, progress=shown, say=say,
+            )  # fmt: skip
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context, strict=strict)
 

@@ -20,10 +20,12 @@ from aeromatch_cli.report.figures import (
     round_length,
     svg,
 )
-from aeromatch_cli.results.adjustment import Calibration, Parameter
+from aeromatch_cli.results.adjustment import Calibration, HeightErrors, Parameter
 from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.sfm.bundle.network import LENS
 from aeromatch_cli.sfm.calibration import camera_of
+from aeromatch_cli.sfm.quality.finding import WHOLE_BLOCK, part_words
+from aeromatch_cli.words import form
 
 # Cells along the longer side of a picture; a mean of fewer residuals shows their noise.
 _CELLS, _FEWEST = 16, 5
@@ -56,8 +58,9 @@ class CameraSection:
 
 @dataclass(frozen=True)
 class HeightsSection:
-    """Expected errors of heights: a map (SVG) and what it means."""
+    """Expected errors of heights of one group: of what, a map (SVG) and what it means."""
 
+    title: str
     plan: str
     words: str
 
@@ -80,7 +83,8 @@ def camera_sections(
                 _moved(calibration.parameters, camera, camera_id),
                 _remaining(adjusted, camera, camera_id, own, keypoints_px),
             )
-            words = f"{calibration.images} images, {camera.model}, {camera.width_px} x {camera.height_px} px"
+            count = calibration.images
+            words = f"{count} {form(count, 'image')}, {camera.model}, {camera.width_px} x {camera.height_px} px"
             shown = tuple(field for field in fields if field is not None)
             rows = tuple(_rows(calibration, found.held_by))
             sections[camera_id] = CameraSection(camera_id, words, rows, shown)
@@ -135,9 +139,7 @@ def _moved(parameters: Mapping[str, Parameter], camera: Camera, camera_id: str) 
         f"What the calibration does: where the adjusted camera puts image points, against the camera known before "
         f"(focal length, principal point and distortion together); up to {longest:.1f} px."
     )
-    return _arrows(
-        camera, places[known], moved_px[known], f"camera {camera_id}, adjusted less known before", "moved"
-    ), words
+    return _arrows(camera, places[known], moved_px[known], camera_id, "adjusted less known before", "moved"), words
 
 
 def _remaining(
@@ -169,10 +171,11 @@ def _remaining(
         f"What remains: means of the residuals of image points, measured less adjusted, in cells of {cell_px:.0f} px; "
         f"up to {largest:.2f} px. Arrows without order are noise; a pattern is distortion that the camera model lacks."
     )
-    return _arrows(camera, places, means_px, f"camera {camera_id}, means of residuals", "remaining"), words
+    return _arrows(camera, places, means_px, camera_id, "means of residuals", "remaining"), words
 
 
-def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, title: str, css: str) -> str:
+def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, camera_id: str, title: str, css: str) -> str:
+    """An arrow at every place (N, 2) of a picture. The camera, whose name may be long, is named above the figure."""
     left, right, bottom, top = _FIELD_EDGES_IN
     height = (_FIELD_IN - left - right) * camera.height_px / camera.width_px + bottom + top
     margins = {
@@ -192,14 +195,20 @@ def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, title: s
     shown = round_length(usual)
     axes.quiverkey(arrows, 0.86, 1.045, enlarged * shown, f"{shown:g} px", labelpos="E", color=COLOURS["accent"])
     axes.set_title(f"{title}; arrows enlarged {enlarged:.3g} times", fontsize=10, loc="left")
-    return svg(axes.figure, title, "lens", {})
+    return svg(axes.figure, f"camera {camera_id}, {title}", "lens", {})
 
 
-def heights_section(found: AdjustResult) -> HeightsSection | None:
-    """Of the largest group whose errors are known."""
-    heights = next((group.heights for group in found.groups if group.heights is not None), None)
-    if heights is None:
-        return None
+def heights_sections(found: AdjustResult, names: Mapping[str, str]) -> list[HeightsSection]:
+    """One of every group whose errors are known. names: of the files, by image_id."""
+    return [
+        _heights_section(group.heights, part_words(group, found.groups, names))
+        for group in found.groups
+        if group.heights is not None
+    ]
+
+
+def _heights_section(heights: HeightErrors, part: str) -> HeightsSection:
+    """part: what these are the errors of, in words."""
     points = np.array(heights.points, dtype=np.float64).reshape(-1, 3)
 
     def length(value: float) -> str:
@@ -208,10 +217,11 @@ def heights_section(found: AdjustResult) -> HeightsSection | None:
 
     words = (
         f"Standard deviations of the heights of {len(points)} points, as measurements and geometry let expect them; "
-        f"median {length(heights.sigma)}. The middle of the block may lie {length(heights.bowl)} above or "
+        f"median {length(heights.sigma)}. The middle of {part} may lie {length(heights.bowl)} above or "
         f"below its border, one side {length(heights.tilt)} above or below the middle."
     )
-    return HeightsSection(_height_map(points, heights.pixel, in_world=heights.metric), words)
+    title = "Expected errors of heights" + ("" if part == WHOLE_BLOCK else f" in {part}")
+    return HeightsSection(title, _height_map(points, heights.pixel, in_world=heights.metric), words)
 
 
 def _height_map(points: FloatArray, pixel: float, *, in_world: bool) -> str:

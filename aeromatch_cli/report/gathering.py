@@ -9,7 +9,7 @@ import contextlib
 import gc
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -29,7 +29,7 @@ from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.geometry.coverage import cells_of
 from aeromatch_cli.images.remote import RemoteFile
 from aeromatch_cli.report.previews import DrawnMatches
-from aeromatch_cli.report.rows import NOT_JUDGED, ImageRow, PairRow
+from aeromatch_cli.report.rows import NOT_JUDGED, OWN_FRAME, ImageRow, PairRow
 from aeromatch_cli.report.stretches import made_of, stretches
 from aeromatch_cli.results.stages import Ninths
 from aeromatch_cli.stages.cascade import feature_workspaces
@@ -102,10 +102,11 @@ def gather(
     draw: Draw | None = None,
     spread: Mapping[str, Ninths] | None = None,
     poses: Mapping[str, Pose] | None = None,
+    own_frame: Collection[str] = (),
 ) -> Gathered:
     """Everything about pairs and images. spread: image_id -> its ninths with a point, empty ones, points of three
-    images. poses: image_id -> the pose that rows state, by default that of the context. Raises WorkspaceError where a
-    file is broken."""
+    images. poses: image_id -> the pose that rows state, by default that of the context. own_frame: images whose
+    poses lie in a frame that nothing ties to the world. Raises WorkspaceError where a file is broken."""
     found = _Found()
     for stretch in _stretches(context, draw):
         found.add(stretch)
@@ -115,7 +116,8 @@ def gather(
         taken, reasons = steps.get((row.image_id0, row.image_id1), ("", ""))
         pairs[place] = replace(row, steps=taken, step_reasons=reasons)
     known = context.block.poses if poses is None else poses
-    return Gathered(pairs, _image_rows(context, pairs, found, spread or {}, known), found.drawn)
+    words = {i: OWN_FRAME if i in own_frame else _pose_words(pose) for i, pose in known.items()}
+    return Gathered(pairs, _image_rows(context, pairs, found, spread or {}, words), found.drawn)
 
 
 def _stretches(context: Context, draw: Draw | None) -> list[_Found]:
@@ -186,7 +188,7 @@ def _image_rows(
     pairs: Sequence[PairRow],
     found: _Found,
     spread: Mapping[str, Ninths],
-    poses: Mapping[str, Pose],
+    poses: Mapping[str, str],
 ) -> list[ImageRow]:
     proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
     tied: Counter[str] = Counter()
@@ -209,7 +211,7 @@ def _image_rows(
                 image_id=image.image_id,
                 name=image.name,
                 href=_href(context, image),
-                pose=_pose_words(poses.get(image.image_id)),
+                pose=poses.get(image.image_id, "none"),
                 keypoints=keypoints,
                 pairs=proposed[image.image_id],
                 verified_pairs=tied[image.image_id],
@@ -279,9 +281,7 @@ def _median(values: FloatArray) -> float:
     return float((ordered[(len(values) - 1) // 2] + ordered[len(values) // 2]) / 2)
 
 
-def _pose_words(pose: Pose | None) -> str:
-    if pose is None:
-        return "none"
+def _pose_words(pose: Pose) -> str:
     return "position" if pose.world_rotation is None else "full"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -36,7 +37,7 @@ from aeromatch_cli.report.adjustment import (
     read_position_residuals,
     surveyed_rows,
 )
-from aeromatch_cli.report.calibration import CameraSection, camera_sections, heights_section
+from aeromatch_cli.report.calibration import CameraSection, camera_sections, heights_sections
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.gathering import Gathered, gather, settled
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
@@ -46,6 +47,7 @@ from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
 from aeromatch_cli.report.residuals import residual_section
 from aeromatch_cli.report.rows import (
     NOT_JUDGED,
+    OWN_FRAME,
     ImageRow,
     PairRow,
     evaluation_figures,
@@ -80,7 +82,10 @@ def run(context: Context) -> StageReport:
     shown = as_adjusted(context.block, adjusted, in_world=adjustment.in_world)
     # Rows state of every image whether it has a pose, in whatever frame.
     poses = context.block.poses if adjusted is None else {**shown.poses, **adjusted_poses(adjusted)}
-    found = gather(context, pair_table, adjustment.judged.spread, poses)
+    own_frame = (context.block if adjusted is None else adjusted).aside(in_world=True)
+    found = gather(
+        context, pair_table, adjustment.judged.spread, poses, own_frame if adjustment.in_world else poses.keys()
+    )
     with settled():
         page = render(context, found, adjustment, adjusted)
     write_text(context.workspace.report, page)
@@ -165,7 +170,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
         ),
         cameras=_cameras(context, adjustment, adjusted),
         readout_not_tried=adjustment.found.readout_not_tried,
-        heights=heights_section(adjustment.found),
+        heights=heights_sections(adjustment.found, {row.image_id: row.name for row in images}),
         residuals=surveyed_rows(control),
         residuals_after_fit=control is not None and control.transformation is not None,
         block=_block_facts(context, gsd_m, in_world=adjustment.in_world),
@@ -246,13 +251,17 @@ def _headline(
     images: Sequence[ImageRow], pairs: Sequence[PairRow], links: FilterResult, failures: Sequence[Any]
 ) -> list[tuple[str, str, str]]:
     """(number, words, level) of each tile; level "", "warn" or "bad"."""
-    posed = sum(row.pose != "none" for row in images)
-    full = sum(row.pose == "full" for row in images)
+    poses = Counter(row.pose for row in images)
+    own_frame = f"; {poses[OWN_FRAME]:,} oriented in a frame of their own" if poses[OWN_FRAME] else ""
     verified = sum(row.state == "verified" for row in pairs)
     matches, parts, weak = links.verified_matches, len(links.components), len(links.weakly_tied)
     tiles = [
         (counted(len(images), "image", "images"), False),
-        (f"{posed:,} with position, {full:,} with attitude, given or found", False),
+        (
+            f"{poses['full'] + poses['position']:,} with position, {poses['full']:,} with attitude, given or found"
+            + own_frame,
+            False,
+        ),
         (counted(len(pairs), "pair compared", "pairs compared"), False),
         (counted(verified, "verified pair", "verified pairs"), not verified),
         (counted(matches, "verified match", "verified matches"), not matches),

@@ -10,6 +10,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray
 from aeromatch_cli.report.figures import COLOURS, histogram_axes, label_width, name_ground_axes, new_axes, svg
+from aeromatch_cli.words import form
 
 # Cells along the longer side of the ground, of the overlap count; and of the points, as many as their number allows.
 _FINE, _COARSE = 160, (6, 40)
@@ -19,23 +20,31 @@ _MORE_IMAGES = 10
 _WIDTH_IN, _HEIGHTS_IN = 7.0, (3.2, 7.0)
 # Room for the bar of colours and its numbers, for the labels below and for the title.
 _BAR_IN, _LABELS_IN, _TITLE_IN = 1.0, 0.6, 0.35
+# Footprints are drawn so many of their sizes beyond the outermost cameras: views of the horizon would shrink all else.
+_FARTHEST = 1.5
 _LARGEST_ERROR = 0.99  # quantile
 _MANY_IMAGES = 20
 
 
 @dataclass(frozen=True)
 class Ground:
-    """What is drawn of the world: corners (2,) in metres. in_world: else in a frame without north and metres."""
+    """What is drawn of the world: corners (2,) in metres. in_world: else in a frame without north and metres. cut:
+    whether ground that images show lies beyond."""
 
     low_m: FloatArray
     high_m: FloatArray
     in_world: bool = True
+    cut: bool = False
 
     @classmethod
     def of(cls, centers_m: FloatArray, footprints: Sequence[FloatArray], *, in_world: bool = True) -> Ground:
-        """Cameras (N, 2) and half a footprint around them: views of the horizon would shrink all else."""
-        size = float(np.median([np.ptp(polygon, axis=0).max() for polygon in footprints]))
-        return cls(centers_m.min(axis=0) - 0.5 * size, centers_m.max(axis=0) + 0.5 * size, in_world)
+        """Cameras (N, 2) and the footprints around them, as far as they are not many times as large as usual."""
+        most_m = _FARTHEST * float(np.median([np.ptp(polygon, axis=0).max() for polygon in footprints]))
+        corners = np.concatenate([polygon[:, :2] for polygon in footprints])
+        shown = np.concatenate([centers_m, corners])
+        low_m = np.maximum(shown.min(axis=0), centers_m.min(axis=0) - most_m)
+        high_m = np.minimum(shown.max(axis=0), centers_m.max(axis=0) + most_m)
+        return cls(low_m, high_m, in_world, bool(((corners < low_m) | (corners > high_m)).any()))
 
     def cells(self, longest: int) -> tuple[int, int]:
         """Columns and rows."""
@@ -78,7 +87,8 @@ def ground_figures(
     parts = [] if adjusted is None else adjusted.parts()
     if parts and len(parts[0].points_m):
         figures.append(_points_figure(ground, footprints, parts[0].points_m))
-    alone = " The other groups of images are left out." if len(parts) > 1 else ""
+    cut = f" Ground more than {_FARTHEST:g} footprints beyond the cameras is not drawn." if ground.cut else ""
+    alone = cut + (" The other groups of images are left out." if len(parts) > 1 else "")
     return [(figure, words + alone) for figure, words in figures]
 
 
@@ -95,6 +105,8 @@ def _points_figure(ground: Ground, footprints: Sequence[FloatArray], points_m: F
         f"Red: {weak.sum():,} of {well_seen.sum():,} places that three images and more show have fewer than "
         f"{_FEW_POINTS} points ({share:.0f} %)."
     )
+    if beyond := len(points_m) - int(points.sum()):
+        words += f" {beyond:,} of {len(points_m):,} points {form(beyond, 'lies', 'lie')} beyond the drawing."
     return _field(ground, points, points > 0, label, weak), words
 
 
@@ -158,7 +170,9 @@ def _images_figure(seen: IntArray) -> str:
     axes.set(xlabel=label, ylabel="points", xticks=range(int(numbers[0]), int(numbers[-1]) + 1))
     axes.grid(visible=False, axis="x")
     axes.yaxis.set_major_formatter("{x:,.0f}")
-    titles = [f"{number} images: {count:,} points" for number, count in zip(numbers, counts, strict=True)]
+    titles = [
+        f"{number} images: {count:,} {form(count, 'point')}" for number, count in zip(numbers, counts, strict=True)
+    ]
     return svg(axes.figure, "images that see a point", "histogram", {"bar": titles})
 
 
@@ -178,7 +192,7 @@ def _errors_figure(errors_px: FloatArray) -> str:
     axes.grid(visible=False, axis="x")
     axes.yaxis.set_major_formatter("{x:,.0f}")
     titles = [
-        f"{low:.2f} to {high:.2f} px: {count:,} points"
+        f"{low:.2f} to {high:.2f} px: {count:,} {form(count, 'point')}"
         for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True)
     ]
     return svg(axes.figure, "reprojection errors", "histogram", {"bar": titles})

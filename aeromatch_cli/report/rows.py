@@ -31,10 +31,13 @@ from aeromatch_cli.results.stages import (
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import result_of
 from aeromatch_cli.store.naming import item_named
+from aeromatch_cli.words import form
 from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"
-_UNENHANCED = "images not enhanced (same illumination)"
+# Of a pose that lies in a frame which nothing ties to the world.
+OWN_FRAME = "own frame"
+_UNENHANCED = "image not enhanced (same illumination)", "images not enhanced (same illumination)"
 
 
 @dataclass(frozen=True)
@@ -71,11 +74,11 @@ class PairRow:
 class ImageRow:
     """One image. href: relative link to the picture, or "". keypoints, coverage: None where there are no features.
 
-    pose: "full", "position" or "none". coverage: share of the image's cells that hold a verified match. views: virtual
-    views that its features come from, None where none are on file. shadow: share of the picture that the enhancement
-    treated as shadow, None where it looks for none. ninths: how many of the image (3 x 3) hold a point of the adjusted
-    block, empty_ninths: how many hold none though other images show them, points_of_three: its points that three and
-    more images see; None where it is not adjusted.
+    pose: "full", "position", "own frame" (one that nothing ties to the world) or "none". coverage: share of the image's
+    cells that hold a verified match. views: virtual views that its features come from, None where none are on file.
+    shadow: share of the picture that the enhancement treated as shadow, None where it looks for none. ninths: how many
+    of the image (3 x 3) hold a point of the adjusted block, empty_ninths: how many hold none though other images show
+    them, points_of_three: its points that three and more images see; None where it is not adjusted.
     """
 
     image_id: str
@@ -171,50 +174,56 @@ def _details(result: StageResult | None) -> Iterator[str]:
     """What a stage has found, in words; nothing is said of what is zero or unknown."""
     match result:
         case OrientResult():
-            yield from _counts((result.images_matched, "images matched in the first pass"), (result.points, "points"))
+            yield from _counts(
+                (result.images_matched, "image matched in the first pass", "images matched in the first pass"),
+                (result.points, "point"),
+            )
         case PairsResult():
             yield f"of {result.images:,} images"
         case ViewsResult():
             yield from _view_words(result)
         case EnhanceResult():
-            yield from _counts((result.images_skipped_same_illumination, _UNENHANCED))
+            yield from _counts((result.images_skipped_same_illumination, *_UNENHANCED))
         case MatchResult():
-            few = result.not_settled, "pairs left with few matches"
-            yield from _counts((result.matches, "matches before verification"), few)
+            few = result.not_settled, "pair left with few matches", "pairs left with few matches"
+            yield from _counts((result.matches, "match before verification", "matches before verification"), few)
         case FilterResult():
-            yield from _counts((result.verified_matches, "verified matches"))
+            yield from _counts((result.verified_matches, "verified match", "verified matches"))
         case RefineResult():
-            yield from _counts((result.measured, "keypoints measured"), (result.keypoints, "matched"))
+            yield from _counts(
+                (result.measured, "keypoint measured", "keypoints measured"), (result.keypoints, "matched", "matched")
+            )
             if result.shift_px:
                 yield f"moved by {result.shift_px:.2f} px (median)"
         case AdjustResult():
-            yield from _counts((result.images, "images oriented"), (result.points, "points"))
+            yield from _counts((result.images, "image oriented", "images oriented"), (result.points, "point"))
             if result.track_length:
                 yield f"{result.track_length:.1f} images per point"
             if result.reprojection_error_px:
                 yield f"mean reprojection error {result.reprojection_error_px:.2f} px"
         case ConsistencyResult():
             yield from _counts(
-                (result.verified_matches, "verified matches left"),
-                (result.dropped_matches, "dropped"),
-                (result.rejected_pairs, "pairs dropped as a whole"),
-                (result.points_left, "points left"),
+                (result.verified_matches, "verified match left", "verified matches left"),
+                (result.dropped_matches, "dropped", "dropped"),
+                (result.rejected_pairs, "pair dropped as a whole", "pairs dropped as a whole"),
+                (result.points_left, "point left", "points left"),
             )
 
 
 def _view_words(result: ViewsResult) -> Iterator[str]:
     if isinstance(result, ExtractResult):
-        empty = result.images_without_keypoints, "images without keypoints"
-        yield from _counts((result.keypoints, "keypoints"), empty)
+        empty = result.images_without_keypoints, "image without keypoints", "images without keypoints"
+        yield from _counts((result.keypoints, "keypoint"), empty)
     if result.images:
         yield f"{result.views_per_image:.3g} views per image"
         yield f"{result.megapixels_per_image:.3g} megapixels together"
     if isinstance(result, ExtractResult):
-        yield from _counts((result.images_skipped_same_illumination, _UNENHANCED))
+        yield from _counts((result.images_skipped_same_illumination, *_UNENHANCED))
 
 
-def _counts(*counts: tuple[int | None, str]) -> Iterator[str]:
-    return (f"{count:,} {words}" for count, words in counts if count)
+def _counts(*counts: tuple[int | None, *tuple[str, ...]]) -> Iterator[str]:
+    """Each with its words, of one and of several; the latter are left out where the noun alone has an s more."""
+    return (f"{count:,} {form(count, *words)}" for count, *words in counts if count)
 
 
 def failure_rows(context: Context) -> list[dict[str, str]]:

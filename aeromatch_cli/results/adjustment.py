@@ -175,6 +175,7 @@ class GroupResult(Record):
     )
     registered: list[str] = Field(description="Image ids that were added to the group by its points.")
     images: int
+    first_image: str = Field("", description="Image id of the first of its images, which tells groups apart.")
     points: int
     track_length: float = Field(description="Images per point, mean.")
     reprojection_error_px: float | None = Field(description="Mean, pixels.")

@@ -122,7 +122,10 @@ def refine(folder: Path) -> None:
         held |= lenses.keys()
         name = f"model{len(models)}.npz"
         _write_model(folder / name, model, lenses, given, outcome)
-        result = GroupResult(kind=kind, registered=[*map(names.image, registered)], control=control, **figures(model))
+        first = names.image(min(image_numbers(model)))
+        result = GroupResult(
+            kind=kind, registered=[*map(names.image, registered)], first_image=first, control=control, **figures(model)
+        )
         if outcome is not None:
             result = adjusted_group(result, outcome, observed, names)
         models.append({"file": name, "result": result.as_json()})

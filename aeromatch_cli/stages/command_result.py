@@ -18,6 +18,7 @@ from aeromatch_cli.stages.quality import quality_of, results_of
 from aeromatch_cli.stages.result_summary import closing_lines, verdict_lines
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
 from aeromatch_cli.store.naming import item_named, names_on_file, with_names
+from aeromatch_cli.words import form
 from aeromatch_cli.workspace import Workspace
 
 # Commands that end with a verdict on the block.
@@ -71,9 +72,11 @@ def command_result(
     *,
     part: bool = False,
     old_page: bool = False,
+    unjudged: int = 0,
 ) -> Result:
     """What a command has come to. names: of the files, by image_id. part: of a shard. old_page: whether there is a
-    report page that does not tell of this state."""
+    report page that does not tell of this state. unjudged: pairs whose matches the command has made, and that are not
+    verified with these."""
     first = next(report for report in reports if report.stage == "pairs")
     lines = said.rest(block_of(reports).summary)
     for stage in reports:
@@ -88,6 +91,9 @@ def command_result(
         told_lost = lost_lines(workspace, lost, len(names) + len(unread))
         lines += [*closing_lines(quality, results, names), *told_lost]
         urgent = [*([] if quality.verdict == "good" else verdict_lines(quality)), *told_lost]
+    if unjudged:
+        pairs = form(unjudged, "pair is", "pairs are")
+        lines.append(f"next      {unjudged} {pairs} not verified with these matches: `aeromatch filter` does that")
     lines.append(f"workspace {workspace.root}")
     if reports[-1].stage == "report":
         lines.append(f"report    {workspace.report}")

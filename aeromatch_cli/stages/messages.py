@@ -21,6 +21,7 @@ from aeromatch_cli.sfm.control import offset_words
 from aeromatch_cli.sfm.mapping import Group
 from aeromatch_cli.stages.filter import WEAK_MATCHES
 from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.words import form
 
 # What a control figure is of, in words.
 _CHECKED = {"check points": "check points", "leave one out": "each control point, fitted without it"}
@@ -64,13 +65,13 @@ def _views_words(found: ViewsResult) -> Iterator[str]:
         views, megapixels = found.views_per_image, found.megapixels_per_image
         yield f"views per image: {views:.3g}, {megapixels:.3g} megapixels together"
     if isinstance(found, ExtractResult):
-        if found.images_without_keypoints:
-            yield f"{found.images_without_keypoints} images without keypoints"
+        if empty := found.images_without_keypoints:
+            yield f"{empty} {form(empty, 'image')} without keypoints"
         yield from _skipped_words(found.images_skipped_same_illumination)
 
 
 def _skipped_words(count: int | None) -> list[str]:
-    return [f"{count} images not enhanced (skipped: same illumination)"] if count else []
+    return [f"{count} {form(count, 'image')} not enhanced (skipped: same illumination)"] if count else []
 
 
 def settled_words(found: MatchResult) -> str:
@@ -80,14 +81,18 @@ def settled_words(found: MatchResult) -> str:
     by, lacking = found.settled_by, found.not_settled
     whole = sum(by.values()) + lacking
     counts = ", ".join(f"{count} by {name}" for name, count in by.items())
-    lack = f"; {lacking} with fewer matches, or less of the overlap covered, than asked for" if lacking else ""
+    lack = (
+        f"; {lacking} with fewer matches, or less of the overlap covered, than the last step asks for"
+        if lacking
+        else ""
+    )
     return f"of {whole} pairs settled: {counts}{lack}"
 
 
 def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) -> list[str]:
     """States of the pairs and how images are connected; of a part of the pairs (a shard) the states alone."""
     states = ", ".join(f"{count} {state}" for state, count in found.pairs.items()) or "none"
-    lines = [f"pairs: {states}; {found.verified_matches} verified matches"]
+    lines = [f"pairs: {states}; {_matches(found.verified_matches, 'verified ')}"]
     if part:
         return lines
     if found.unread:
@@ -179,10 +184,8 @@ def frame_remarks(found: OrientResult, groups: Sequence[Group]) -> list[str]:
         ]
     if found.frame == "own":
         return [f"{why} the result is in a frame of its own: scale, north and place are arbitrary"]
-    return [
-        f"{beside} images are tied to no position and lie beside the others: scale, north and place are arbitrary, "
-        "unless final matches tie them"
-    ]
+    what = form(beside, "image is tied to no position and lies", "images are tied to no position and lie")
+    return [f"{beside} {what} beside the others: scale, north and place are arbitrary, unless final matches tie them"]
 
 
 def _adjust_lines(found: AdjustResult, images: int, names: Mapping[str, str]) -> list[str]:
@@ -191,8 +194,8 @@ def _adjust_lines(found: AdjustResult, images: int, names: Mapping[str, str]) ->
         return found.remarks
     error_px = "unknown" if found.reprojection_error_px is None else f"{found.reprojection_error_px:.2f} px"
     words = [
-        f"{found.images} of {images} images oriented, {found.points} points in {found.track_length:.1f} images each, "
-        f"reprojection error {error_px}"
+        f"{found.images} of {images} images oriented, {found.points} {form(found.points, 'point')} in "
+        f"{found.track_length:.1f} images each, reprojection error {error_px}"
     ]
     if len(found.groups) > 1:
         sizes = ", ".join(str(group.images) for group in found.groups)
@@ -216,12 +219,20 @@ def _consistency_lines(found: ConsistencyResult, names: Mapping[str, str]) -> li
     if not found.dropped_matches and not found.rejected_pairs:
         return lines
     rejected, expected = found.rejected_pairs, found.expected_right
-    pairs = f", all of {rejected} {'pair' if rejected == 1 else 'pairs'} among them" if rejected else ""
-    why = ["contradict the adjusted block"] if found.points or expected is None else []
-    why += [] if expected is None else ["are not likely to be right"]
+    dropped, left = found.dropped_matches, found.verified_matches or 0
+    pairs = f", all of {rejected} {form(rejected, 'pair')} among them" if rejected else ""
+    why = []
+    if found.points or expected is None:
+        why.append(f"{form(dropped, 'contradicts', 'contradict')} the adjusted block")
+    if expected is not None:
+        why.append(f"{form(dropped, 'is', 'are')} not likely to be right")
     right = "" if expected is None else f", of which {100 * expected:.1f} % are expected to be right to 3 px"
-    words = f"{found.dropped_matches} matches {' or '.join(why)}{pairs}"
-    return [f"{words}; {found.verified_matches} verified matches are left{right}", *lines]
+    words = f"{_matches(dropped)} {' or '.join(why)}{pairs}"
+    return [f"{words}; {_matches(left, 'verified ')} {form(left, 'is', 'are')} left{right}", *lines]
+
+
+def _matches(count: int, kind: str = "") -> str:
+    return f"{count} {kind}{form(count, 'match', 'matches')}"
 
 
 def _spread_words(found: ConsistencyResult) -> str:
@@ -246,7 +257,10 @@ def control_words(control: Control | None, adjusted: Sequence[ControlInGroup] = 
     every group."""
     if control is None:
         return []
-    counts = f"control: {control.control} control points, {control.check} check points"
+    counts = (
+        f"control: {control.control} control {form(control.control, 'point')}, "
+        f"{control.check} check {form(control.check, 'point')}"
+    )
     if control.points and len(control.not_measured_in_two_images) == control.points:
         return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
     apart = control.rays_do_not_meet
@@ -289,7 +303,8 @@ def _adjusted_words(control: ControlInGroup) -> Iterator[str]:
     if control.kept and not control.used:
         yield f"the block as it is: RMSE at check points {_axes(with_m)} m" if with_m else "no check points"
     elif control.kept:
-        yield f"{len(control.used)} control points take part in the adjustment{errors}"
+        used = len(control.used)
+        yield f"{used} control {form(used, 'point takes', 'points take')} part in the adjustment{errors}"
     else:
         yield f"the control points were left out of the adjustment, since they make it no better{errors}"
 

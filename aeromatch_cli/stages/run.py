@@ -49,6 +49,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.stages.within import (
     Deadline,
     fitting,
@@ -56,6 +57,7 @@ from aeromatch_cli.stages.within import (
     measured_in_time,
     page_in_time,
     steps_in_time,
+    without_steps,
 )
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import Workspace, locked
@@ -81,13 +83,15 @@ def execute(
     *,
     shard: str | None = None,
     within: str | None = None,
+    started: float | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Result:
     """Run one command. Raises AeromatchError where nothing can be done, KeyboardInterrupt where it was stopped.
 
-    within: how long a whole run may take, such as 20m. say: gets the summary of the block before the long stages;
+    within: how long a whole run may take, such as 20m. started: when that time began, on the clock of time.monotonic();
+    now, unless it is given. say: gets the summary of the block before the long stages;
     without it the summary stands in the result's lines.
     """
     part = Shard.parse(shard) if shard else None
@@ -95,7 +99,8 @@ def execute(
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
     if within is not None and (part or command != "run"):
         raise ConfigError("--within is for a whole `aeromatch run`: leave out --within, or --shard")
-    deadline = None if within is None else Deadline(within)
+    now = time.monotonic() if started is None else started
+    deadline = None if within is None else Deadline(within, started=now)
     root = Path(settings.workspace)
     if settings.block.images and command in graph.NEED_RESULTS and not root.exists():
         raise InputError(f"the workspace {root} does not exist: run `aeromatch run`, which makes it, or name another")
@@ -245,6 +250,8 @@ def _attempt(asked: _Asked) -> Result:
         reports += _run_all(context, reports[-1], deadline)
     elif context.settings.cascade and command in _AFTER_CASCADE:
         context, made = _cascaded(context) if command == "match" else (_joined(context), [])
+        if command == "match" and context.scope.shard is None:
+            _tell_left_out(context, reports[-1], without_steps(block_of(reports).left_out))
         reports += made
         if command != "match":
             reports += _stages_of(command, context)
@@ -260,11 +267,20 @@ def _attempt(asked: _Asked) -> Result:
         )
     names = {image.image_id: image.name for image in context.block.images}
     failures = all_failures(command, context, reports)
+    unjudged = _unjudged(context) if command == "match" else 0
     old_page = command in JUDGED and report.is_of_earlier_results(context.workspace)
     return command_result(
         command, context.settings, context.workspace, names, reports, failures, said,
-        part=context.scope.shard is not None, old_page=old_page,
+        part=context.scope.shard is not None, old_page=old_page, unjudged=unjudged,
     )  # fmt: skip
+
+
+def _unjudged(context: Context) -> int:
+    """Count the pairs with matches that are not verified with these; of a shard nothing is said."""
+    if context.scope.shard is not None:
+        return 0
+    state = BlockState.of(context)
+    return sum(state.are_matched(pair) for pair in state.outdated_pairs())
 
 
 def _timed(result: Result, deadline: Deadline | None) -> Result:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 from aeromatch_cli.config import Settings, dump
@@ -40,6 +40,8 @@ _PLANNED = 0.9
 _WORTH = 0.05
 # What workers take to load a network.
 _NETWORK_S = 3.0
+# How what is said of a step that is left out begins.
+_STEP = "without the step "
 
 
 def seconds_of(text: str) -> float:
@@ -245,15 +247,22 @@ def steps_in_time(context: Context, deadline: Deadline) -> list[StepContext]:
         if count:
             step = cascade.steps_on_file(part)[-1]
             if not _fits(step, done[0], deadline):
+                # Each step has a limit of its own, and pairs are settled that have what the last one asks for.
+                limit = f"by its limit (below_matches {every[count - 1].below_matches})"
                 deadline.left_out.append(
-                    f"without the step {step.name}, which {_pairs(len(step.reasons))} would have taken"
+                    f"{_STEP}{step.name}, which {_pairs(len(step.reasons))} would have taken {limit}"
                 )
-                deadline.left_out += [f"without the step {other.name}" for other in every[count:]]
+                deadline.left_out += [f"{_STEP}{other.name}" for other in every[count:]]
                 break
         reports = [step.reports for step in done]
         steps = cascade.run(part)
         done = [replace(step, reports=before) for step, before in zip(steps, reports, strict=False)] + steps[-1:]
     return done
+
+
+def without_steps(left_out: Sequence[str]) -> list[str]:
+    """What is still left out once all steps of the cascade are made."""
+    return [words for words in left_out if not words.startswith(_STEP)]
 
 
 def _fits(step: StepContext, first: StepContext, deadline: Deadline) -> bool:

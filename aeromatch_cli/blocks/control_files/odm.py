@@ -23,6 +23,7 @@ from aeromatch_cli.blocks.fields import IMAGE, fields_of, with_name
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, coordinate, is_number, units_of_comments
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.words import form
 
 _COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z]"
 _CHECK_NAME = "CHK-"
@@ -55,7 +56,8 @@ def read_gcp_list(source: Source) -> Survey:
     named = [name for name in points if name.upper().startswith(_CHECK_NAME)]
     remarks = []
     if named:
-        remarks.append(f"{source.path.name}: {len(named)} points are check points by their name ({_CHECK_NAME}...)")
+        some = form(len(named), "point is a check point", "points are check points")
+        remarks.append(f"{source.path.name}: {len(named)} {some} by name ({_CHECK_NAME}...)")
     if exchanged:
         remarks.append(f"{source.path.name}: the names of image and point are exchanged: they were put right")
     return Survey(

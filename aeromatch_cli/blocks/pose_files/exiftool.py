@@ -21,6 +21,7 @@ from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.units import degrees_of, metres_of
 from aeromatch_cli.blocks.xmp import from_level, tag_number, xmp_angles
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.words import form
 
 _IMAGE = "SourceFile"
 # Groups whose tag counts before that of others: degrees with a sign.
@@ -60,7 +61,8 @@ def read_exiftool(source: Source) -> PoseList:
             f"{source.path}: no image of this ExifTool table has GPSLatitude and GPSLongitude: write it by "
             "`exiftool -csv -n -r IMGS`"
         )
-    remarks = [f"{source.path.name}: {unposed} images have no GPS position there"] if unposed else []
+    some = form(unposed, "image has", "images have")
+    remarks = [f"{source.path.name}: {unposed} {some} no GPS position there"] if unposed else []
     remarks += [f"{source.path.name}: {count} of {len(rows)} images had {what}" for what, count in said.items()]
     return PoseList(tuple(rows), "geographic", tuple(remarks), "ExifTool table")
 

@@ -33,6 +33,7 @@ from aeromatch_cli.geometry.ellipsoid import enu_from_geocentric
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
+from aeromatch_cli.words import form
 
 _ANGLES = (("yaw", "pitch", "roll"), ("omega", "phi", "kappa"), ("phi", "omega", "kappa"))
 _LONGEST_CODE = 20  # longer ones are WKT
@@ -83,7 +84,9 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     words.append("/".join(angles) if any(row.attitude for row in rows) else "positions")
     remarks = []
     if disabled:
-        remarks.append(f"{source.path.name}: {disabled} cameras are not enabled there; they are used")
+        remarks.append(
+            f"{source.path.name}: {disabled} {form(disabled, 'camera is', 'cameras are')} not enabled there, but used"
+        )
     if 0 < used_estimated < len(rows):
         remarks.append(
             f"{source.path.name}: {len(rows) - used_estimated} of {len(rows)} images have no estimated position there; "
@@ -252,7 +255,8 @@ def read_cameras_xml(source: Source) -> PoseList:
         raise ConfigError(
             f"{source.path}: no camera of this Metashape file is aligned: align the photos, or export the reference"
         )
-    remarks = [f"{source.path.name}: {unaligned} cameras are not aligned there"] if unaligned else []
+    some = form(unaligned, "camera is", "cameras are")
+    remarks = [f"{source.path.name}: {unaligned} {some} not aligned there"] if unaligned else []
     kind = "geographic" if georeferenced == {True} else "grid"
     words = "georeferenced" if kind == "geographic" else "not georeferenced"
     title = f"Metashape cameras.xml, {words}"

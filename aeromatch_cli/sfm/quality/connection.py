@@ -17,6 +17,7 @@ from aeromatch_cli.sfm.quality.finding import (
     positions_given,
     rms,
 )
+from aeromatch_cli.words import form
 
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
@@ -55,7 +56,7 @@ def unread(evidence: QualityInput) -> Iterator[Finding]:
     if not evidence.unread:
         return
     lacking, images = len(evidence.unread), evidence.images + len(evidence.unread)
-    verb = "is" if lacking == 1 else "are"
+    verb = form(lacking, "is", "are")
     words = f"{lacking} of {images} images {verb} not in the block, since the pictures could not be read"
     remedy = f"replace or remove {evidence.named(evidence.unread)}; failures.csv says why"
     yield finding_of("unread images", lacking / images, _LEFT_OUT, words, remedy)
@@ -65,7 +66,8 @@ def left_out(evidence: QualityInput) -> Found:
     """Judge how many images are not registered."""
     outside = list(evidence.adjust.outside)
     missing = max(len(outside), evidence.images - evidence.adjust.images)
-    words = f"{evidence.images - missing} of {evidence.images} images are oriented"
+    oriented = evidence.images - missing
+    words = f"{oriented} of {evidence.images} images {form(oriented, 'is', 'are')} oriented"
     if outside:
         one = evidence.names.get(outside[0], outside[0])
         remedy = (

@@ -8,7 +8,15 @@ from aeromatch_cli.results.adjustment import (
     GroupResult,
     HeightErrors,
 )
-from aeromatch_cli.sfm.quality.finding import Found, Limits, QualityInput, finding_of, plain
+from aeromatch_cli.sfm.quality.finding import (
+    Found,
+    Limits,
+    QualityInput,
+    angles_given,
+    finding_of,
+    part_words,
+    plain,
+)
 
 # Expected deformations: how far the middle of the block may lie above its border, ground pixels; and by which angle it
 # may be tilted, degrees, which is what one strip has about its line.
@@ -29,7 +37,7 @@ def deformation(evidence: QualityInput) -> Found:
         return
 
     def part(group: GroupResult) -> str:
-        return "the block" if len(evidence.groups) == 1 else f"the part of {group.images} images"
+        return part_words(group, evidence.groups, evidence.names)
 
     worst, heights = max(known, key=lambda one: one[1].in_pixels(one[1].bowl))
     words = f"the middle of {part(worst)} may lie {_length(heights, heights.bowl)} above or below its border"
@@ -41,9 +49,10 @@ def deformation(evidence: QualityInput) -> Found:
     worst = max((group for group, _ in placed), key=tilt_deg)
     angle = tilt_deg(worst)
     words = f"{part(worst)} may be tilted by {angle:.2f} degrees"
+    measured = "" if angles_given(evidence) else "measured angles, "
     remedy = (
         "its positions are not exact enough over its extent: exacter ones, a second strip beside a single one, "
-        "measured angles, or three control points tell"
+        f"{measured}or three control points tell"
     )
     yield finding_of("tilt", angle, TILT_DEG, words, remedy)
     stated = [(group, heights, group.positions.stated_m[2]) for group, heights in placed if group.positions]

@@ -21,6 +21,7 @@ LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
 Limits = tuple[float, float | None]
 # Of the given positions, the share that the pictures contradict: single wrong ones happen.
 WRONG_POSITIONS: Limits = (0.05, 0.3)
+WHOLE_BLOCK = "the block"
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,15 @@ class QualityInput(Record):
         return shown + (f" and {len(image_ids) - most} more" if len(image_ids) > most else "")
 
 
+def part_words(group: GroupResult, groups: Sequence[GroupResult], names: Mapping[str, str]) -> str:
+    """Say which part of a block a group of its images is; parts may have equally many. names: of the files, by
+    image_id."""
+    if len(groups) == 1:
+        return WHOLE_BLOCK
+    image = names.get(group.first_image, group.first_image)
+    return f"the part of {group.images} images" + (f" with {image}" if image else "")
+
+
 Found = Iterator[Finding | str]
 
 
@@ -114,6 +124,12 @@ def positions_given(evidence: QualityInput) -> int:
     """Count the images with a given position, those that the orientation has left out as well, of which the adjustment
     does not know."""
     return max(evidence.adjust.positions_given, evidence.orient.positions_given if evidence.orient else 0)
+
+
+def angles_given(evidence: QualityInput) -> bool:
+    """Whether oriented images have given angles."""
+    residuals = evidence.adjust.residuals
+    return residuals is not None and residuals.rotation_deg_median is not None
 
 
 def flight_words(name: str) -> str:

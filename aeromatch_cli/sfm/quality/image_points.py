@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from aeromatch_cli.sfm.quality.calibration import with_held
 from aeromatch_cli.sfm.quality.finding import Finding, Found, Level, Limits, QualityInput, finding_of
+from aeromatch_cli.words import form
 
 # Mean distance of an image point from where its point is seen, pixels of the picture that it was found in: tie points
 # measured by least squares, and those of a detector as it has left them. Sound blocks have 0.1 to 0.5 and 0.5 to 0.9.
@@ -40,6 +41,7 @@ def multiplicity(evidence: QualityInput) -> Found:
     remedy = "" if level == "good" else ": where two see it nothing checks them; more overlap, or more keypoints, helps"
     yield Finding("images per point", length, _FEWEST_IMAGES_PER_POINT, level, words + remedy)
     held = evidence.adjust.held_by_pairs
-    words = f"{held} of {evidence.adjust.images} images have hardly a point that three images see"
+    verb = form(held, "has", "have")
+    words = f"{held} of {evidence.adjust.images} images {verb} hardly a point that three images see"
     share = held / evidence.adjust.images
     yield finding_of("held by pairs", share, _HELD_BY_PAIRS, words, "more overlap, or more keypoints, helps")

@@ -24,6 +24,7 @@ from aeromatch_cli.sfm.quality.finding import (
     positions_given,
     rms,
 )
+from aeromatch_cli.words import form
 
 # Root mean square of the differences from given positions, in stated standard deviations: 1 is what was promised. Wide
 # statements (5 m of GPS without a better word) are met easily, and that is good.
@@ -53,7 +54,8 @@ def positions(evidence: QualityInput) -> Found:
     images = sum(one.images for one in found)
     wrong = [i for one in found for i in one.wrong]
     remedy = f"{evidence.named(wrong)}; check which position belongs to which image"
-    words = f"{len(wrong)} of {images} given positions contradict the pictures and are not used"
+    verbs = ("contradicts", "is") if len(wrong) == 1 else ("contradict", "are")
+    words = f"{len(wrong)} of {images} given positions {verbs[0]} the pictures and {verbs[1]} not used"
     yield finding_of("wrong positions", len(wrong) / images, WRONG_POSITIONS, words, remedy)
     met = [(one.rms_sigmas, one.rms_m, one.stated_m) for one in found if one.rms_sigmas and one.rms_m]
     if not met:
@@ -64,12 +66,18 @@ def positions(evidence: QualityInput) -> Found:
         "they are less exact than stated, or another focal length, time or antenna offset stands behind it; state "
         "their real accuracy, or correct their cause"
     )
-    for name, axes in (("horizontally", [0, 1]), ("vertically", [2])):
+    for name, axes in (("horizontally", "xy"), ("vertically", "z")):
+        of = ["xyz".index(axis) for axis in axes]
         sigmas, off_m, stated_m = (
-            float(np.sqrt(shares @ [rms(np.array(one)[axes]) ** 2 for one in values]))
+            float(np.sqrt(shares @ [rms(np.array(one)[of]) ** 2 for one in values]))
             for values in zip(*met, strict=True)
         )
-        words = f"positions are met {name} to {plain(off_m, 3)} m, {sigmas:.1f} times the {plain(stated_m, 3)} m stated"
+        # Of x and y together, as in the page's table; what is stated is stated of each.
+        error_m = off_m * np.sqrt(len(of))
+        words = (
+            f"positions are met {name} to {plain(error_m, 3)} m (root mean square in {axes.upper()}), "
+            f"{sigmas:.1f} times what is stated, {plain(stated_m, 3)} m{' along each axis' if len(of) > 1 else ''}"
+        )
         yield finding_of(f"positions {name}", sigmas, _POSITION_SIGMAS, words, with_held(evidence, remedy))
 
 
@@ -80,9 +88,10 @@ def flights(evidence: QualityInput) -> Found:
         stated_m = (np.inf, np.inf, np.inf) if group.positions is None else group.positions.stated_m
         for flight in group.flights:
             name, images, step_m = flight_words(flight.flight), flight.images, flight.step_m
+            of = f"{images} {form(images, 'image')}"
             if step_m:
                 words = (
-                    f"heights of {name} ({images} images) lie {abs(step_m):.1f} m "
+                    f"heights of {name} ({of}) lie {abs(step_m):.1f} m "
                     f"{'above' if step_m > 0.0 else 'below'} those of the others, which was taken out"
                 )
                 remedy = "check the zero of its heights; control points tell which flight is right"
@@ -90,7 +99,7 @@ def flights(evidence: QualityInput) -> Found:
             shift_m, sigma_m = np.array(flight.shifts).T
             if (np.abs(shift_m) > _SIGNIFICANT * sigma_m).any():
                 shown = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", shift_m, strict=True))
-                words = f"positions of {name} ({images} images) are off by {shown} m, which was taken out"
+                words = f"positions of {name} ({of}) are off by {shown} m, which was taken out"
                 remedy = "check its base station, geoid and coordinate system; control points tell what is right"
                 if shift_to_control_m(group) is not None:  # adjust says what it is, and which heights are right
                     yield Finding("shift of a flight", None, None, "good", words)

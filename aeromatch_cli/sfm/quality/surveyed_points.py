@@ -15,6 +15,7 @@ from aeromatch_cli.results.adjustment import (
 )
 from aeromatch_cli.sfm.heights import height_remedy, shift_of_points_m, zeros_words
 from aeromatch_cli.sfm.quality.finding import Finding, Found, Limits, QualityInput, finding_of
+from aeromatch_cli.words import form
 
 # Root mean square at points that took no part, in their standard deviations and those of their measurement.
 _CONTROL_SIGMAS: Limits = (3.0, 8.0)
@@ -69,7 +70,7 @@ def _contradicting(control: Control, adjusted: Sequence[ControlInGroup]) -> Find
         if one.kept:
             left_out.update(one.wrong, one.exchanged)
     count = max(control.control + control.check + len(left_out), 1)
-    words = f"{len(unlike)} of {count} surveyed points contradict the others"
+    words = f"{len(unlike)} of {count} surveyed points {form(len(unlike), 'contradicts', 'contradict')} the others"
     remedy = f"{', '.join(sorted(unlike)[:5])}; check their names, coordinates and where they were measured"
     return finding_of("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
 

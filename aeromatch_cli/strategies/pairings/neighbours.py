@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from aeromatch_cli.data import Block
+from aeromatch_cli.geometry.places import place_labels
 from aeromatch_cli.strategies.pairings.measure import ordered
 
 
@@ -54,16 +56,36 @@ def order_neighbours(ids: Sequence[str], wanted: Collection[str], each_side: int
     return pairs
 
 
-def fallback_pairs(block: Block, unplaced: Collection[str], count: int) -> dict[tuple[str, str], str]:
+def fallback_pairs(
+    block: Block, unplaced: Collection[str], count: int, *, within_places: bool = False
+) -> dict[tuple[str, str], str]:
     """Pairs of images without a footprint, each with the rule that found it.
 
     An image with a position gets its `count` nearest images by position. One without gets count / 2 on either side in
-    the order of capture times, where it has one, and of names.
+    the order of capture times, where it has one, and of names. within_places: images too far apart to show the same
+    ground are no neighbours by position, and one that lies apart from all others is paired as one without position.
     """
     positioned = {i for i in unplaced if i in block.poses and np.isfinite(block.poses[i].center_m).all()}
+    places = _places(block) if within_places else {}
+    positioned -= {i for members in places.values() if len(members) == 1 for i in members}
     lost = set(unplaced) - positioned
     each_side = (count + 1) // 2
     reasons = dict.fromkeys(order_neighbours(name_order(block), lost, each_side), "name")
     reasons |= dict.fromkeys(order_neighbours(time_order(block), lost, each_side), "time")
-    reasons |= dict.fromkeys(position_neighbours(block, positioned, count), "position")
+    if len(places) < 2:
+        return reasons | dict.fromkeys(position_neighbours(block, positioned, count), "position")
+    for members in places.values():
+        part = replace(block, poses={i: block.poses[i] for i in members})
+        reasons |= dict.fromkeys(position_neighbours(part, positioned & members, count), "position")
     return reasons
+
+
+def _places(block: Block) -> dict[int, set[str]]:
+    """The images with position by their place; none of a frame without metres."""
+    ids = [i for i in block.poses if np.isfinite(block.poses[i].center_m).all()]
+    found: dict[int, set[str]] = {}
+    if block.metric and ids:
+        labels = place_labels(np.array([block.poses[i].center_m for i in ids]))
+        for image_id, label in zip(ids, labels.tolist(), strict=True):
+            found.setdefault(label, set()).add(image_id)
+    return found

@@ -107,7 +107,7 @@ class Overlap(Strategy):
                 chosen.append(Pair(*ordered(ids[idx0], ids[idx1]), float(share), float(angle), self.name))
         paired = {image_id for pair in chosen for image_id in (pair.image_id0, pair.image_id1)}
         unplaced = {image.image_id for image in block.images} - paired
-        fallback = fallback_pairs(block, unplaced, self.fallback_neighbours)
+        fallback = fallback_pairs(block, unplaced, self.fallback_neighbours, within_places=True)
         present = {(pair.image_id0, pair.image_id1) for pair in chosen} | fallback.keys()
         placed = footprints.keys()
         tied = {ids: "first pass" for ids in block.tied if ids not in present and not placed >= set(ids)}

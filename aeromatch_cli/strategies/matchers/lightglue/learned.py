@@ -22,7 +22,7 @@ _FEW = 100
 
 
 class LearnedLightGlue(Attention):
-    """Of the features of `extract=learned`.
+    """LightGlue, a network that matches by attention between both images, for the features of `extract=learned`.
 
     The weights that ship turn the attention between both images by the places where poses and ground expect the
     keypoints (`nets.lightglue.Side.ground`), where both are known.

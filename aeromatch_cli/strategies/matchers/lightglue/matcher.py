@@ -206,7 +206,7 @@ class Attention(Search):
 
 
 class LightGlue(Attention):
-    """Of SIFT's keypoints."""
+    """LightGlue, a network that matches by attention between both images, for the features of `extract=sift`."""
 
     version: ClassVar[int] = 6
     reads_descriptors: ClassVar[str] = "RootSIFT"

@@ -1,0 +1,78 @@
+"""Counts and the words that follow them: one is no plural."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from make_results import filled
+
+from aeromatch_cli.data import Pair
+from aeromatch_cli.report.rows import _details
+from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, FilterResult
+from aeromatch_cli.stages import messages, unregistered
+from aeromatch_cli.words import form
+
+
+def test_forms() -> None:
+    assert [form(count, "pair") for count in (0, 1, 2)] == ["pairs", "pair", "pairs"]
+    assert [form(count, "is", "are") for count in (0, 1, 2)] == ["are", "is", "are"]
+
+
+def _reasons(monkeypatch: pytest.MonkeyPatch, pairs: Mapping[tuple[str, str], bool], oriented: str) -> dict[str, str]:
+    """pairs: whether each is verified. oriented: ids of a letter each."""
+    names = sorted({image_id for pair in pairs for image_id in pair})
+    listed = [Pair(*ids, np.nan, np.nan, "position") for ids in pairs]
+    judged = [
+        (pair, SimpleNamespace(verdict=SimpleNamespace(state="verified" if pairs[pair.ids] else "rejected")))
+        for pair in listed
+    ]
+    workspace = SimpleNamespace(features=lambda _: Path(__file__))
+    images = [SimpleNamespace(image_id=name) for name in names]
+    context: Any = SimpleNamespace(block=SimpleNamespace(images=images), pairs=listed, workspace=workspace)
+    monkeypatch.setattr(unregistered.BlockState, "of", lambda _: SimpleNamespace(judged_pairs=lambda: judged))
+    monkeypatch.setattr(unregistered, "read_keypoints", lambda _: (np.zeros((100, 2)),))
+    monkeypatch.setattr(unregistered, "gather_failures", lambda _: [])
+    adjusted: Any = SimpleNamespace(poses=dict.fromkeys(oriented))
+    return unregistered.unregistered_reasons(context, adjusted)
+
+
+def test_an_image_with_one_pair_has_no_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = {("a", "b"): True, ("c", "d"): True, ("d", "e"): True, ("e", "f"): False}
+    assert _reasons(monkeypatch, pairs, "ab") == {
+        "c": "its only verified pair is with an image that is not oriented either",
+        "d": "its 2 verified pairs are with images that are not oriented either",
+        "e": "its only verified pair is with an image that is not oriented either",
+        "f": "its only pair could not be verified",
+    }
+    found = _reasons(monkeypatch, {("a", "b"): True, ("b", "c"): True}, "b")
+    assert found["a"] == "too few points in common with oriented images (1 verified pair)"
+    found = _reasons(monkeypatch, {("a", "b"): True, ("a", "c"): False, ("c", "d"): False}, "")
+    assert found["a"] == "no image could be oriented (1 verified pair of this one)"
+    assert found["c"] == "none of its 2 pairs could be verified"
+
+
+def test_lines_of_one_match() -> None:
+    (line, *_) = messages._filter_lines(filled(FilterResult, verified_matches=1), {}, part=True)
+    assert line.endswith("; 1 verified match")
+    dropped = ConsistencyResult(verified_matches=1, dropped_matches=1, points=3)
+    (line, *_) = messages._consistency_lines(dropped, {})
+    assert line == "1 match contradicts the adjusted block; 1 verified match is left"
+    dropped = ConsistencyResult(verified_matches=20, dropped_matches=2, expected_right=0.98)
+    (line, *_) = messages._consistency_lines(dropped, {})
+    left = "20 verified matches are left, of which 98.0 % are expected to be right to 3 px"
+    assert line == f"2 matches are not likely to be right; {left}"
+
+
+def test_stages_of_the_page_count_one_thing() -> None:
+    assert list(_details(AdjustResult(images=1, points=2)))[:2] == ["1 image oriented", "2 points"]
+    found = ConsistencyResult(verified_matches=1, dropped_matches=1, rejected_pairs=1, points_left=1)
+    words = ["1 verified match left", "1 dropped", "1 pair dropped as a whole", "1 point left"]
+    assert list(_details(found)) == words
+    words = ["2 verified matches left", "2 dropped", "2 pairs dropped as a whole", "2 points left"]
+    found = ConsistencyResult(verified_matches=2, dropped_matches=2, rejected_pairs=2, points_left=2)
+    assert list(_details(found)) == words
