@@ -46,6 +46,14 @@ def test_a_changed_byte_is_found_in_every_file(done_site: Site) -> None:
         assert len(re.findall(r"(?m)^damaged: ", outcome.stderr)) == len(outcome.facts["damaged"])
 
 
+def test_a_broken_description_of_the_block_is_one_of_the_damaged_files(done_site: Site) -> None:
+    path = done_site.work / "block.json"
+    path.write_text(path.read_text(encoding="utf-8").replace('"crs"', "crs"), encoding="utf-8")
+    outcome = invoke("check", "--deep", str(done_site.work), "--json")
+    assert outcome.code == 1
+    assert list(outcome.facts["damaged"]) == ["block.json"]
+
+
 def test_rows_of_the_index_are_checked(done_site: Site) -> None:
     with closing(sqlite3.connect(done_site.work / "index.sqlite")) as database, database:
         database.execute("UPDATE known SET value = '[\"other\", 5]' WHERE path LIKE 'features/%'")

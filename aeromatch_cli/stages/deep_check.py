@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.stages.command_result import Result
 from aeromatch_cli.stages.messages import listed
 from aeromatch_cli.store.damage import find_damage
-from aeromatch_cli.workspace import opened_workspace
+from aeromatch_cli.workspace import Workspace, opened_workspace
 
 log = logging.getLogger("aeromatch")
 
@@ -17,8 +18,11 @@ _NAMED = 5
 
 
 def run(root: Path) -> Result:
-    """Compare every file of a workspace with its checksum. Raises as `opened_workspace`, but for its tables."""
-    workspace = opened_workspace(root, tables=False)
+    """Compare every file of a workspace with its checksum. Raises as `opened_workspace`, but for damaged files."""
+    try:
+        workspace = opened_workspace(root, tables=False)
+    except BrokenFileError:  # of block.json: it is named among the damaged
+        workspace = Workspace(root)
     found = find_damage(workspace)
     lines = [f"checked          {found.files:,} files, {found.size_bytes / 1e6:,.1f} MB"]
     if found.without_checksum:

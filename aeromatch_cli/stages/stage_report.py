@@ -80,8 +80,10 @@ class StageReport:
         before = result_of(old)
         # Without a result of its own the stage only counts what it makes: the one on file still holds.
         self.result = self.result or before
-        told = old.failures, old.fingerprint, old.files, before
-        return told == (self.failures, self.fingerprint, self.files, self.result)
+        told = old.failures, old.fingerprint, old.files, None if before is None else before.as_json()
+        # As they are written: what is not a number is null there, and differs from itself here.
+        result = None if self.result is None else self.result.as_json()
+        return told == (self.failures, self.fingerprint, self.files, result)
 
     def record_files(self, context: Context, paths: Iterable[Path]) -> None:
         """State the files that the stage has written, as they are now."""
