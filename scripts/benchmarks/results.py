@@ -65,7 +65,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = options.make_parser("results", __doc__)
     add = parser.add_argument
     add("--data", type=Path, metavar="DIR", help="folder of real blocks, BLOCK/images and BLOCK/reference")
-    add("--anchors", type=Path, metavar="DIR", help="homography pairs of danini/magsac; else without")
+    add("--anchors", type=Path, metavar="DIR", help="homography pairs of danini/magsac: some minutes more")
     add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks; else without")
     add("--only", type=options.names, default=",".join(STANDING), help="comma-separated")
     add("--docs", action="store_true", help="write the tables into docs/results and their figures into the README")
