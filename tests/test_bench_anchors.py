@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from benchmarks import __main__
 from benchmarks.anchors.judge import error_px
-from benchmarks.anchors.layouts import anchors_in, moved
+from benchmarks.anchors.layouts import anchors_in
 
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.files import read_json
+from aeromatch_cli.geometry.frames import apply_homography
 
 HOMOGRAPHY = np.array([[0.9, 0.1, 12.0], [-0.08, 0.95, 20.0], [1e-4, -5e-5, 1.0]])
 
@@ -40,7 +41,7 @@ def write_homogr(folder: Path) -> np.ndarray:
     """Nine points of the plane, the centre of the first pixel at (1, 1)."""
     write_pair(folder / "oneA.jpg", folder / "oneB.jpg")
     grid = np.stack(np.meshgrid([60.0, 160.0, 250.0], [60.0, 160.0, 250.0]), axis=-1).reshape(-1, 2)
-    table = np.column_stack([grid, moved(HOMOGRAPHY, grid)]) + 1.0
+    table = np.column_stack([grid, apply_homography(HOMOGRAPHY, grid)]) + 1.0
     lines = "\n".join(",".join(f"{value:.4f}" for value in row) for row in table)
     (folder / "one.csv").write_text(f"x0,y0,x1,y1\n{lines}\n", encoding="utf-8")
     return grid
@@ -51,14 +52,14 @@ def test_each_layout_is_read(tmp_path: Path) -> None:
     (one,) = anchors_in("homogr", tmp_path / "homogr")
     assert one.name == "one"
     np.testing.assert_allclose(one.truth((320, 320), (320, 320))[0], grid, atol=1e-3)
-    np.testing.assert_allclose(one.truth((320, 320), (320, 320))[1], moved(HOMOGRAPHY, grid), atol=1e-3)
+    np.testing.assert_allclose(one.truth((320, 320), (320, 320))[1], apply_homography(HOMOGRAPHY, grid), atol=1e-3)
     for n in (2, 4):
         write_pair(tmp_path / "hpatches" / "v_x" / "1.ppm", tmp_path / "hpatches" / "v_x" / f"{n}.ppm")
         np.savetxt(tmp_path / "hpatches" / "v_x" / f"H_1_{n}", HOMOGRAPHY)
     two, four = anchors_in("hpatches", tmp_path / "hpatches")
     assert (two.name, four.image1.name, four.image0.name) == ("v_x-2", "4.ppm", "1.ppm")
     places0, places1 = two.truth((320, 320), (320, 320))
-    np.testing.assert_allclose(places1, moved(HOMOGRAPHY, places0))
+    np.testing.assert_allclose(places1, apply_homography(HOMOGRAPHY, places0))
     assert 0 < len(places0) < 25  # some corners leave the picture
     write_pair(tmp_path / "evd" / "1" / "cafe.png", tmp_path / "evd" / "2" / "cafe.png")
     (tmp_path / "evd" / "h").mkdir()
@@ -88,13 +89,13 @@ def test_what_is_no_data_set_says_so(tmp_path: Path) -> None:
 def test_errors_are_distances_from_the_truth() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(0.0, 800.0, (200, 2))
-    there = moved(HOMOGRAPHY, points)
+    there = apply_homography(HOMOGRAPHY, points)
     there[150:] = rng.uniform(0.0, 800.0, (50, 2))  # a quarter is wrong
     places = rng.uniform(0.0, 800.0, (10, 2))
-    exact, explained = error_px(points, there, places, moved(HOMOGRAPHY, places), planar=True)
+    exact, explained = error_px(points, there, places, apply_homography(HOMOGRAPHY, places), planar=True)
     assert exact < 1e-3
     assert 150 <= explained < 160
-    off, _ = error_px(points, there, places, moved(HOMOGRAPHY, places) + np.array([3.0, 4.0]), planar=True)
+    off, _ = error_px(points, there, places, apply_homography(HOMOGRAPHY, places) + np.array([3.0, 4.0]), planar=True)
     assert off == pytest.approx(5.0, abs=0.01)
     assert error_px(points[:7], there[:7], places, places, planar=True) == (float("inf"), 0)
 

@@ -82,7 +82,7 @@ def run(context: Context) -> StageReport:
     shown = as_adjusted(context.block, adjusted, in_world=adjustment.in_world)
     # Rows state of every image whether it has a pose, in whatever frame.
     poses = context.block.poses if adjusted is None else {**shown.poses, **adjusted_poses(adjusted)}
-    own_frame = (context.block if adjusted is None else adjusted).aside(in_world=True)
+    own_frame = images_aside(context.block, adjusted, in_world=True)
     found = gather(
         context, pair_table, adjustment.judged.spread, poses, own_frame if adjustment.in_world else poses.keys()
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
-from benchmarks.anchors.layouts import moved
+from aeromatch_cli.geometry.frames import apply_homography
 
 _PLANE_PX, _LINES_PX, _CONFIDENCE, _ITERATIONS = 3.0, 1.0, 0.9999, 10_000
 _FEWEST = 8
@@ -31,7 +31,7 @@ def error_px(
     if model is None or model.shape != (3, 3):
         return float("inf"), 0
     if planar:
-        off = np.linalg.norm(moved(model, places0) - places1, axis=1)
+        off = np.linalg.norm(apply_homography(model, places0) - places1, axis=1)
     else:
         lines = np.column_stack([places0, np.ones(len(places0))]) @ model.T
         there = np.column_stack([places1, np.ones(len(places1))])

@@ -20,6 +20,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import InputError
+from aeromatch_cli.geometry.frames import apply_homography
 
 # Points of a grid that a homography moves: they stand for hand-measured ones.
 _GRID = 5
@@ -45,16 +46,9 @@ class Anchor:
         assert self.homography is not None
         axes = (np.linspace(0.0, side - 1.0, _GRID) for side in size0)
         grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-        there = moved(self.homography, grid)
+        there = apply_homography(self.homography, grid)
         inside = ((there >= 0.0) & (there <= np.array(size1) - 1.0)).all(axis=1)
         return grid[inside], there[inside]
-
-
-def moved(homography: FloatArray, points: FloatArray) -> FloatArray:
-    """Points (N, 2) under a homography (3, 3)."""
-    there = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(there[:, :2] / there[:, 2:])
 
 
 def _homogr(folder: Path) -> Iterator[Anchor]:
