@@ -83,7 +83,7 @@ class LearnedFeatures(Step):
     Views are halved as by `extract=learned` itself, but never where `extract.pixels_per_keypoint` is 0.
     """
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     cheap_to_match: ClassVar[bool] = True
     expectation_weights: ClassVar[tuple[float, ...] | None] = (0.989, 0.852, -0.348, -0.018, 0.449)
     name: Literal["learned"] = "learned"
@@ -99,9 +99,9 @@ class LearnedFeatures(Step):
     )
     keypoints: int | None = _KEYPOINTS
     lightglue: bool = Field(
-        False,
+        True,
         description="Match the step's features by LightGlue, which is told where the poses expect each keypoint, as "
-        "well as by nearest neighbours. More matches of difficult pairs; half a second more per pair.",
+        "well as by nearest neighbours. false: fewer matches of difficult pairs, half a second less per pair.",
     )
     precision: Precision = _PRECISION
     device: Device = DEVICE
