@@ -96,7 +96,7 @@ def test_oblique_is_what_its_tables_say() -> None:
     found = load("oblique")
     assert found.pairs.max_view_angle_deg == 90.0
     assert (found.simulate.name, found.extract.name) == ("neighbours", "learned")
-    assert (found.match.name, found.match.ratio, found.match.guided) == ("bidirectional", 0.9, True)
+    assert (found.match.name, found.match.guided, found.match.expect_places) == ("lightglue-learned", True, True)
     assert [one.name for one in found.filter] == ["epipolar", "graph"]
 
 

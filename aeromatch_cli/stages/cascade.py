@@ -46,6 +46,9 @@ _IMAGES_AT_HAND = 1024
 _RARE = 0.02
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
+# The strongest descriptors of a view that LightGlue compares: two rendered city blocks, and every 3rd and 4th image of
+# lewis and ochota, have as many correct matches and points with twice as many (99 to 101 %), in twice the seconds.
+_SHOWN = 1024
 # An image that no step has tied yet may show another place. So many partners, those with most matches, tell.
 _TRIED_PARTNERS = 3
 # Matches of two steps that are nearer than this in both images are one.
@@ -89,7 +92,7 @@ _SETTINGS_OF: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]
             device=step.device,
             **_reduction(settings),
         ),
-        "match": LearnedLightGlue(precision=step.precision, device=step.device)
+        "match": LearnedLightGlue(precision=step.precision, device=step.device, max_keypoints=_SHOWN)
         if step.lightglue
         else Bidirectional(ratio=0.9, guided=True),
     },

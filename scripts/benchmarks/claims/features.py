@@ -31,7 +31,7 @@ CODE = (*OUR_CODE, *PEER_CODE, "lab/synthetic", "evaluate", "benchmarks/claims/f
 SCENES = ("city", "hills")
 SIZE, IMAGES, KEYPOINTS = "800x600", 20, 2048
 OBLIQUE_DEG = 40.0
-_AS_TAKEN = "simulate=none,match.guided=false"
+_AS_TAKEN = "simulate=none,match=bidirectional,match.ratio=0.9"
 SUPERPOINT, STEP, RECTIFIED, WHOLE = "SuperPoint", "learned features", "SIFT on rectified views", "oblique"
 RIVALS: Mapping[str, str] = {
     "SIFT": "opencv-sift",
@@ -45,11 +45,11 @@ ABOUT: Mapping[str, str] = {
     "SIFT": "OpenCV's, with the ratio test, on the images as taken",
     "ASIFT": "OpenCV's, the same number of descriptors over all its views",
     SUPERPOINT: "with the published weights, on the images as taken",
-    "GeoDesc, stand-in": "SIFT keypoints with this project's descriptor, on the images as taken, not guided",
+    "GeoDesc, stand-in": "SIFT keypoints with this project's descriptor, on the images as taken, the same test",
     "ContextDesc, stand-in": "the same with context in the descriptor",
-    STEP: "this project's keypoints and descriptor, on the images as taken, not guided",
+    STEP: "this project's keypoints and descriptor, on the images as taken, the ratio test from either image",
     RECTIFIED: "OpenCV's SIFT on this project's ground views",
-    WHOLE: "the preset, with guided search",
+    WHOLE: "the preset, with LightGlue and guided search",
 }
 RATIOS = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
 TWO_WAY, ONE_WAY = "two-way", "one-way"
@@ -100,7 +100,7 @@ def ratio_rows(scene: str, seed: int, count: int, out: Path) -> list[Row]:
     """The ratio test from either image and from one, on the features of the preset, before and after one filter."""
     judged, pairs = _oblique(scene, seed, count, out)
     preset = Preset(
-        judged.scene, Options(KEYPOINTS, "image", 1, seed, None), preset="oblique", settings=("match.guided=false",)
+        judged.scene, Options(KEYPOINTS, "image", 1, seed, None), preset="oblique", settings=("match=bidirectional",)
     )
     known = {image: preset.features(image) for image in sorted({image for pair in pairs for image in pair.images})}
     rows = []

@@ -53,7 +53,7 @@ from benchmarks.tables import (
 THREADS = 2
 ENOUGH_CORRECT = 30
 METHODS = (
-    "oblique,oblique+lightglue=oblique[match=lightglue-learned],fusion,baseline,"
+    "oblique,oblique+nearest=oblique[match=bidirectional,match.ratio=0.9,match.guided=true],fusion,baseline,"
     "SIFT=opencv-sift,pycolmap,pycolmap-guided,aliked@ground,"
     "aliked+lightglue,aliked+lightglue@ground,disk+lightglue@ground,xfeat+lighterglue@ground"
 )

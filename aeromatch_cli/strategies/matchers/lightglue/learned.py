@@ -11,14 +11,14 @@ from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison,
 from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
 from aeromatch_cli.strategies.matchers.descriptors.search import Steps, guide_below_field, guided_field
 from aeromatch_cli.strategies.matchers.lightglue.inference import NetworkInput, with_expected_places
-from aeromatch_cli.strategies.matchers.lightglue.matcher import Attention, network_below_field
+from aeromatch_cli.strategies.matchers.lightglue.matcher import Attention, network_below_field, width_field
 
 # Learned descriptors are less alike than those of SIFT: as in the preset oblique.
 _RATIO = 0.9
 # Every pair is guided and shown to the network, which finds more in easy ones as well.
 _EVERY = 100_000
 # With places half a picture off, or turned by 90 degrees, 13 and 93 matches of a pair of ochota agree with one pose;
-# with right places 805.
+# with right places 805. A hard pair has few with right places, too, and more than without the network.
 _FEW = 100
 
 
@@ -29,7 +29,7 @@ class LearnedLightGlue(Attention):
     keypoints (`nets.lightglue.Side.ground`), where both are known.
     """
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     reads_descriptors: ClassVar[str] = "GeoDesc"
     shipped: ClassVar[str] = "lightglue-learned"
     signed: ClassVar[bool] = True
@@ -37,6 +37,9 @@ class LearnedLightGlue(Attention):
     guided: bool = guided_field(default=True)
     guide_below_matches: int = guide_below_field(_EVERY)
     network_below_matches: int = network_below_field(_EVERY)
+    # Twelve real pairs of 2,048 descriptors: 240 correct matches a pair with 0.99, 239 with 0.95 in three fifths of the
+    # network's seconds.
+    width_confidence: float = width_field(0.95)
     expect_places: bool = Field(
         True, description="Tell the network where poses and ground expect each keypoint, where they are known."
     )
@@ -49,10 +52,13 @@ class LearnedLightGlue(Attention):
         """All of the geometry where places are expected."""
         return self.needs if self.expect_places else super().reads()
 
-    def by_network(self, comparison: Comparison, shown: tuple[BoolArray, BoolArray] | None = None) -> Steps[Found]:
-        """Once more without expected places where few agree with them: wrong ones hide all matches of a pair."""
-        found = yield from super().by_network(comparison, shown)
-        if not self.expect_places or len(found.rows) >= _FEW:
+    def by_network(
+        self, comparison: Comparison, shown: tuple[BoolArray, BoolArray] | None = None, known: int = 0
+    ) -> Steps[Found]:
+        """Once more without expected places where few agree with them, and no more than are known without the network:
+        wrong ones hide all matches of a pair."""
+        found = yield from super().by_network(comparison, shown, known)
+        if not self.expect_places or len(found.rows) >= _FEW or len(found.rows) > known:
             return found
         anyhow = yield from self.model_copy(update={"expect_places": False}).by_network(comparison, shown)
         return most_evident(comparison, [found, anyhow])

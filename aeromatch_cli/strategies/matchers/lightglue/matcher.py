@@ -48,6 +48,17 @@ def network_below_field(default: int) -> Any:
     )
 
 
+def width_field(default: float) -> Any:
+    """The setting `width_confidence` of one matcher."""
+    return Field(
+        default,
+        ge=-1.0,
+        le=1.0,
+        description="Confidence (0-1) at which the network drops keypoints; -1 = never. Larger: fewer are dropped, "
+        "more time.",
+    )
+
+
 class Attention(Search):
     """LightGlue (Lindenberger et al., ICCV 2023) for pairs in which the ratio test finds few matches.
 
@@ -84,13 +95,7 @@ class Attention(Search):
         le=1.0,
         description="Confidence (0-1) at which the network stops early; -1 = never. Larger: more layers, more time.",
     )
-    width_confidence: float = Field(
-        0.99,
-        ge=-1.0,
-        le=1.0,
-        description="Confidence (0-1) at which the network drops keypoints; -1 = never. Larger: fewer are dropped, "
-        "more time.",
-    )
+    width_confidence: float = width_field(0.99)
     max_keypoints: int = Field(
         2048,
         ge=1,
@@ -146,7 +151,7 @@ class Attention(Search):
         if len(found.rows) >= self.network_below_matches:
             return found
         shown = in_overlap(comparison, found, self.windows) if self.only_overlap else None
-        closer = yield from self.by_network(comparison, shown)
+        closer = yield from self.by_network(comparison, shown, len(found.rows))
         doubtful = replace(found, costs=np.maximum(found.costs, _DOUBTFUL))
         surer = [joined([closer.take(closer.costs <= 1.0 - least), doubtful]) for least in self._least_probabilities()]
         closer = most_evident(comparison, [*surer, doubtful])
@@ -155,13 +160,16 @@ class Attention(Search):
     def _least_probabilities(self) -> list[float]:
         return [self.threshold, *(least for least in _SURER if least > self.threshold)]
 
-    def by_network(self, comparison: Comparison, shown: tuple[BoolArray, BoolArray] | None = None) -> Steps[Found]:
+    def by_network(
+        self, comparison: Comparison, shown: tuple[BoolArray, BoolArray] | None = None, known: int = 0
+    ) -> Steps[Found]:
         """Matches of all view pairs that are comparable, each keypoint once, costs 1 - probability.
 
-        shown: (K0,), (K1,) the keypoints that the other image may show.
+        shown: (K0,), (K1,) the keypoints that the other image may show. known: number of matches without the network.
         The network is symmetric up to rounding, and image_id0 < image_id1 fixes which image comes first, so that the
         order of the files changes nothing. Raises ConfigError where weights are missing or expect other descriptors.
         """
+        del known
         if shown is None:
             shown = (
                 np.ones(len(comparison.features0.keypoints_px), bool),
