@@ -196,9 +196,9 @@ def test_points_and_measurements_that_do_not_count_are_named(tmp_path: Path) -> 
     assert remarks == [
         "marks.csv names 1 image that the block does not have: x.jpg",
         "marks.csv measures points twice in an image: the first counts: north in DJI_1.JPG",
-        "1 of 9 measurements of control points lie outside their image and are left out (west in DJI_2.JPG at 2900, "
+        "1 of 9 measurements of control points lies outside their image and is left out (west in DJI_2.JPG at 2900, "
         "3500): are pixel x and y exchanged?",
-        "1 of 4 control points are measured in no image of the block: left out: unseen",
+        "1 of 4 control points is measured in no image of the block: left out: unseen",
         "marks.csv measures 1 point without coordinates in images: left out: other",
     ]
 

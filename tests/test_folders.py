@@ -60,7 +60,9 @@ def test_pictures_before_take_off_are_known_by_their_heights(relative: bool) -> 
     facts = flight(relative=relative)
     assert ground_shots(facts) == {}
     facts |= {name: lowered(facts[name], 100.0) for name in ("00.jpg", "03.jpg")}
-    assert ground_shots(facts) == dict.fromkeys(("00.jpg", "03.jpg"), "were taken on the ground by their heights")
+    assert ground_shots(facts) == dict.fromkeys(
+        ("00.jpg", "03.jpg"), ("was taken on the ground by its height", "were taken on the ground by their heights")
+    )
 
 
 def test_a_descending_terrain_or_a_second_level_is_not_on_the_ground() -> None:
@@ -105,7 +107,7 @@ def test_pictures_on_the_ground_are_named_and_left_out_where_that_is_asked_for(t
     for row in range(8):
         height = 0.0 if row == 0 else 100.0 + row
         write_dji(tmp_path / f"{row}.jpg", 52.5 + 1e-4 * row, 13.4, 400.0 + height, relative=height)
-    words = "1 of 8 images (0.jpg) were taken on the ground by their heights: "
+    words = "1 of 8 images (0.jpg) was taken on the ground by its height: "
     kept = read_inputs(tmp_path, "exif")
     assert len(kept.images) == 8
     assert f"{words}leave them out with --set block.ground_shots=drop" in kept.warnings

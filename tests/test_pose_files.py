@@ -313,7 +313,7 @@ def test_a_crs_with_its_shift_to_wgs84_is_the_crs_itself(tmp_path: Path) -> None
     assert found.crs == "EPSG:32633"
     assert [row.position for row in found.rows] == [(1.5, 2.5, 3.5), (1.0, 2.0, 3.0)]
     assert found.rows[1].sigma_position_m == 0.07
-    assert "1 of 2 images have no estimated position there" in found.warnings[0]
+    assert "1 of 2 images has no estimated position there" in found.warnings[0]
 
 
 def test_folders_tell_images_of_one_name_apart(tmp_path: Path) -> None:

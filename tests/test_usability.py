@@ -158,7 +158,7 @@ def read_grid(folder: Path, crs: str, *positions: tuple[float, float]) -> BlockI
 def test_grid_position_zero_means_unknown(tmp_path, crs):
     inputs = read_grid(tmp_path, crs, (333000, 3100000), (0, 0), (333020, 3100000))
     assert set(inputs.poses) == {"0_jpg", "2_jpg"}
-    assert "1 of 3 images (1.jpg) have the position (0, 0): treated as unposed" in inputs.warnings
+    assert "1 of 3 images (1.jpg) has the position (0, 0): treated as unposed" in inputs.warnings
     # The origin is that of the others.
     assert abs(inputs.poses["0_jpg"].center_m[:2]).max() < 2000
 

@@ -16,6 +16,7 @@ from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.scan import identifier
 from aeromatch_cli.data import Camera
 from aeromatch_cli.geometry.cameras import focal_px, resized
+from aeromatch_cli.words import form
 
 FULL_FRAME_DIAGONAL_MM = 43.267
 # Between a wide and a normal lens: what to start from where nothing is known (COLMAP's default_focal_length_factor).
@@ -204,9 +205,9 @@ def _with_lost_numbers(
     if not unclear:
         return found, ()
     return found, (
-        f"{len(unclear)} of {len(facts)} images ({listed(unclear)}) have no serial number, and others of the same "
-        "model have several: they count as a camera of their own; better keep cameras apart by folders (--cameras "
-        "folder)",
+        f"{len(unclear)} of {len(facts)} images ({listed(unclear)}) {form(len(unclear), 'has', 'have')} no serial "
+        "number, and others of the same model have several: they count as a camera of their own; better keep cameras "
+        "apart by folders (--cameras folder)",
     )
 
 
@@ -266,8 +267,9 @@ def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
         )
     if zoomed:
         said.append(
-            f"{len(zoomed)} of {len(facts)} images were taken with digital zoom ({listed(zoomed)}): the focal length "
-            "is multiplied with it, a calibration in XMP does not count, and a 35-mm equivalent is taken as zoomed"
+            f"{len(zoomed)} of {len(facts)} images {form(len(zoomed), 'was', 'were')} taken with digital zoom "
+            f"({listed(zoomed)}): the focal length is multiplied with it, a calibration in XMP does not count, and a "
+            "35-mm equivalent is taken as zoomed"
         )
     return tuple(said)
 

@@ -33,6 +33,7 @@ from aeromatch_cli.blocks.pose_files.geodesy import unit_remarks
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.words import form
 
 ControlUse = Literal["adjust", "check"]
 
@@ -83,7 +84,9 @@ def read_control(
         points.append(_control_point(point, place_m, seen, check=point.check or use == "check"))
     if unseen:
         count = f"{len(unseen)} of {len(survey.points)} control points"
-        remarks.append(f"{count} are measured in no image of the block: left out: {listed(unseen)}")
+        remarks.append(
+            f"{count} {form(len(unseen), 'is', 'are')} measured in no image of the block: left out: {listed(unseen)}"
+        )
     if measured:
         what = f"{len(measured)} point{'s' if len(measured) > 1 else ''} without coordinates"
         remarks.append(f"{survey.measured_in.name} measures {what} in images: left out: {listed(measured)}")
@@ -297,8 +300,8 @@ def _measured(
     if outside:
         question = "are pixel x and y exchanged?" if turned == len(outside) else "were they measured in these pictures?"
         remarks.append(
-            f"{len(outside)} of {len(marks)} measurements of control points lie outside their image and are left out "
-            f"({listed(outside)}): {question}"
+            f"{len(outside)} of {len(marks)} measurements of control points {form(len(outside), 'lies', 'lie')} "
+            f"outside their image and {form(len(outside), 'is', 'are')} left out ({listed(outside)}): {question}"
         )
     return {point: list(seen.items()) for point, seen in found.items() if seen}, remarks
 

@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.other_files import twins
+from aeromatch_cli.words import form
 
 # Files of equal size differ in their first or last bytes, or nowhere: these many are compared before whole ones.
 _EDGE_BYTES = 65_536
@@ -48,7 +49,8 @@ def remarks_on(found: Mapping[str, str], total: int) -> list[str]:
     if not found:
         return []
     pairs = [f"{name} is {first}" for name, first in found.items()]
-    return [f"{len(found)} of {total} images are there twice ({listed(pairs)}): remove one of each"]
+    verb = form(len(found), "is", "are")
+    return [f"{len(found)} of {total} images {verb} there twice ({listed(pairs)}): remove one of each"]
 
 
 def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
@@ -57,7 +59,8 @@ def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
     if not pairs:
         return []
     shown = listed([" and ".join(same) for same in pairs])
-    return [f"{len(pairs)} pictures are there in two formats ({shown}): remove one of each"]
+    what = form(len(pairs), "picture is", "pictures are")
+    return [f"{len(pairs)} {what} there in two formats ({shown}): remove one of each"]
 
 
 def thumbnails(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
@@ -75,8 +78,9 @@ def thumbnails(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
                 small.append(f"{name} ({own[0]} x {own[1]})")
     if not small:
         return []
+    what = form(len(small), "is a small copy", "are small copies")
     return [
-        f"{len(small)} of {len(sizes_px)} images ({listed(small)}) are small copies of others, such as thumbnails: "
+        f"{len(small)} of {len(sizes_px)} images ({listed(small)}) {what} of others, such as thumbnails: "
         "--exclude leaves them out"
     ]
 

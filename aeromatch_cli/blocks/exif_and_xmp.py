@@ -20,6 +20,7 @@ from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.xmp import from_level
 from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.words import form
 
 _METRES_PER_DEGREE = 111_320.0
 # One of two statements is the coarser where it has at most this share of the other's different numbers.
@@ -89,9 +90,9 @@ def with_conventions(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFact
             continue
         found |= {name: replace(facts[name], angles=replace(one, convention="gimbal")) for name, one in angles.items()}
         remarks.append(
-            f"{_some(names, names)} have a pitch of {np.median(pitches):.0f} degrees, which "
-            "by its tag (Pix4D's Camera:Pitch) looks backwards: it is taken as counted from level, where -90 looks "
-            "down; --set block.angles=nadir reads it by its tag"
+            f"{_some(names, names)} {form(len(names), 'has', 'have')} a pitch of {np.median(pitches):.0f} degrees, "
+            "which by its tag (Pix4D's Camera:Pitch) looks backwards: it is taken as counted from level, where -90 "
+            "looks down; --set block.angles=nadir reads it by its tag"
         )
     return found, remarks
 

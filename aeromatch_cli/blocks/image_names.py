@@ -23,6 +23,7 @@ from aeromatch_cli.blocks.fields import IMAGE
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.words import form
 
 # Running numbers are looked for in so many groups of digits of a name, from the end.
 _DIGIT_GROUPS = 3
@@ -56,11 +57,12 @@ def matched_rows(
         )
     remarks = []
     if absent:
-        what = "1 image that is" if len(absent) == 1 else f"{len(absent)} images that are"
-        remarks.append(f"{source} names {what} not in the folder: {listed(absent)}")
+        what = form(len(absent), "image that is", "images that are")
+        remarks.append(f"{source} names {len(absent)} {what} not in the folder: {listed(absent)}")
     unnamed = [name for name in names if name not in rows]
     if unnamed:
-        remarks.append(f"{len(unnamed)} of {len(names)} images are not in {source}: {listed(unnamed)}")
+        verb = form(len(unnamed), "is", "are")
+        remarks.append(f"{len(unnamed)} of {len(names)} images {verb} not in {source}: {listed(unnamed)}")
     return rows, remarks
 
 

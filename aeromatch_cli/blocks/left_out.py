@@ -18,9 +18,11 @@ from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.other_files import image_suffixes
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
+from aeromatch_cli.words import form
 
-_PANEL = "show a reflectance panel by their XMP"
-_ON_GROUND = "were taken on the ground by their heights"
+# Of one image, of several.
+_PANEL = "shows a reflectance panel by its XMP", "show a reflectance panel by their XMP"
+_ON_GROUND = "was taken on the ground by its height", "were taken on the ground by their heights"
 _METRES_PER_DEGREE = 111_320.0
 # Those on the ground lie within so many metres of each other in height, and so far below all others.
 _LEVEL_M, _GAP_M = 3.0, 10.0
@@ -51,7 +53,10 @@ def excluded(text: str, names: Sequence[str]) -> tuple[frozenset[str], list[str]
             idle += [] if hits else [pattern]
     remarks = []
     if found:
-        remarks.append(f"{len(found)} of {len(names)} images ({listed(sorted(found))}) are left out, as --exclude asks")
+        verb = form(len(found), "is", "are")
+        remarks.append(
+            f"{len(found)} of {len(names)} images ({listed(sorted(found))}) {verb} left out, as --exclude asks"
+        )
     if idle:
         remarks.append(f"--exclude fits no image of the folder: {listed(idle)}")
     return frozenset(found), remarks
@@ -75,20 +80,21 @@ def _lines(path: Path) -> list[str]:
     return [cell for cell in cells if cell]
 
 
-def ground_shots(facts: Mapping[str, ExifFacts]) -> dict[str, str]:
-    """Image name -> why it counts as taken on the ground, in words that go on "they". facts: by image name."""
+def ground_shots(facts: Mapping[str, ExifFacts]) -> dict[str, tuple[str, str]]:
+    """Image name -> why it counts as taken on the ground, in words that go on "it", and in those that go on "they".
+    facts: by image name."""
     found = {name: _PANEL for name, fact in facts.items() if fact.panel}
     rest = {name: fact for name, fact in facts.items() if name not in found}
     return found | dict.fromkeys(_standing(rest), _ON_GROUND)
 
 
-def remarks_on_ground_shots(shots: Mapping[str, str], total: int, *, dropped: bool) -> list[str]:
+def remarks_on_ground_shots(shots: Mapping[str, tuple[str, str]], total: int, *, dropped: bool) -> list[str]:
     """Return one sentence for every reason that `ground_shots` has."""
     remedy = "left out" if dropped else "leave them out with --set block.ground_shots=drop"
     remarks = []
     for reason in dict.fromkeys(shots.values()):
         names = [name for name, one in shots.items() if one == reason]
-        remarks.append(f"{len(names)} of {total} images ({listed(names)}) {reason}: {remedy}")
+        remarks.append(f"{len(names)} of {total} images ({listed(names)}) {form(len(names), *reason)}: {remedy}")
     return remarks
 
 

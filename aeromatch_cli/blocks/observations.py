@@ -27,6 +27,7 @@ from aeromatch_cli.blocks.poses import PoseRow
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.angles import Angles
+from aeromatch_cli.words import form
 
 AngleConvention = Literal["auto", "gimbal", "nadir"]
 
@@ -158,8 +159,12 @@ def oriented(
             sigma_angle_deg=observation.sigma_angle_deg or sigma_angle_deg,
             sigmas_m=sigmas_m if len(set(sigmas_m)) > 1 else None,
         )
-    unusable = {f"lie outside the area of {code}": outside, "have the position (0, 0)": zeros}
-    faults = {words: names for words, names in unusable.items() if names}
+    area = f"outside the area of {code}"
+    faults = {}
+    if outside:
+        faults[form(len(outside), f"lies {area}", f"lie {area}")] = outside
+    if zeros:
+        faults[form(len(zeros), "has the position (0, 0)", "have the position (0, 0)")] = zeros
     return Located(frame, poses, angles, faults, level, level_m)
 
 

@@ -21,6 +21,7 @@ from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.store.matches import match_points
 from aeromatch_cli.store.opened import OpenedBlock
+from aeromatch_cli.words import form
 from aeromatch_cli.workspace import Workspace
 
 # Pairs that truly share this much count, whether they were tried or not.
@@ -120,8 +121,8 @@ def _judged(
     if len(known) < 2 or (unknown and truth.kind == "rendered"):
         more = f" and {len(unknown) - _NAMED} more" if len(unknown) > _NAMED else ""
         raise InputError(
-            f"{len(unknown)} of the {len(images)} images of the workspace are not in the truth {truth_folder} "
-            f"({', '.join(unknown[:_NAMED])}{more}): give the truth of the same block"
+            f"{len(unknown)} of the {len(images)} images of the workspace {form(len(unknown), 'is', 'are')} not in the "
+            f"truth {truth_folder} ({', '.join(unknown[:_NAMED])}{more}): give the truth of the same block"
         )
     for image in known:
         camera = truth.cameras[image.name]

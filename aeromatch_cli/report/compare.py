@@ -20,6 +20,7 @@ from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.settings_diff import said_value
 from aeromatch_cli.stages.stage_report import result_on_file
 from aeromatch_cli.store.opened import OpenedBlock
+from aeromatch_cli.words import form
 from aeromatch_cli.workspace import Workspace
 
 # Differences that are not chance, as a share of the larger value.
@@ -209,7 +210,8 @@ def _match_lines(one: _Side, two: _Side) -> Iterator[str]:
     both = sorted(verified[0] & verified[1])
     ratios = [two.matches[pair] / one.matches[pair] for pair in both]
     if ratios:
-        yield f"            of {len(both)} pairs in both: {np.median(ratios):.2f} x as many (median)"
+        pairs_in_both = f"{len(both)} {form(len(both), 'pair')} in both"
+        yield f"            of {pairs_in_both}: {np.median(ratios):.2f} x as many (median)"
 
 
 def _verified(side: _Side) -> set[tuple[str, str]]:

@@ -44,6 +44,7 @@ from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.stage_report import result_of, result_on_file
 from aeromatch_cli.store.matches import match_points
 from aeromatch_cli.store.opened import OpenedBlock
+from aeromatch_cli.words import form
 from aeromatch_cli.workspace import Workspace
 
 # Partners that are listed one by one.
@@ -160,7 +161,8 @@ def _stage_lines(workspace: Workspace) -> Iterator[str]:
                 yield f"            {states}; {judged.verified_matches} verified matches"
             case ConsistencyResult(verified_matches=int(left)) as final:
                 when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
-                dropped = f"{final.dropped_matches} of them dropped, {final.rejected_pairs} pairs rejected"
+                pairs = form(final.rejected_pairs, "pair")
+                dropped = f"{final.dropped_matches} of them dropped, {final.rejected_pairs} {pairs} rejected"
                 yield f"            {dropped}; {left} are left{when}"
 
 
@@ -399,7 +401,7 @@ def _file_lines(path: Path) -> Iterator[str]:
         yield from json.dumps(_stated(path), indent=2, ensure_ascii=False).splitlines()
     elif suffix == ".csv":
         rows = read_csv(path)
-        yield f"{len(rows)} rows"
+        yield f"{len(rows)} {form(len(rows), 'row')}"
         for name in rows[0] if rows else ():
             values = Counter(row[name] for row in rows)
             often = ", ".join(f"{value or 'empty'} ({count})" for value, count in values.most_common(3))

@@ -14,6 +14,7 @@ from aeromatch_cli.formats.tables import read_picture_quality
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.sharpness import read_quality, shows_nothing, unsharp
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.words import form
 
 _REMEDY = "look at them; --exclude leaves images out"
 
@@ -51,15 +52,19 @@ def remarks(context: Context, found: Mapping[str, PictureQuality]) -> list[str]:
     names = {image.image_id: image.name for image in images}
     for image in images:
         if complaint := found[image.image_id].damage:
-            kinds["are damaged, and a part of them may be gray or noise"].append(f"{image.name} ({complaint})")
+            kinds["damaged, and partly gray or noise perhaps"].append(f"{image.name} ({complaint})")
         nothing = shows_nothing(found[image.image_id])
         if nothing:
-            kinds[f"are almost {nothing}"].append(image.name)
+            kinds[f"almost {nothing}"].append(image.name)
         else:
             cameras[image.camera_id].append(image.image_id)
     for ids in cameras.values():
-        kinds["are far more blurred than the others of their camera"] += [
+        kinds["far more blurred than others of the same camera"] += [
             f"{names[ids[k]]} ({found[ids[k]].blur:.2f})" for k in unsharp([found[i].blur for i in ids])
         ]
     total = len(context.block.images)
-    return [f"{len(some)} of {total} images {what}: {listed(some)}: {_REMEDY}" for what, some in kinds.items() if some]
+    return [
+        f"{len(some)} of {total} images {form(len(some), 'is', 'are')} {what}: {listed(some)}: {_REMEDY}"
+        for what, some in kinds.items()
+        if some
+    ]

@@ -60,6 +60,7 @@ from aeromatch_cli.stages.within import (
     without_steps,
 )
 from aeromatch_cli.store.index import Index
+from aeromatch_cli.words import form
 from aeromatch_cli.workspace import Workspace, locked
 
 log = logging.getLogger("aeromatch")
@@ -362,7 +363,7 @@ def _without_keypoints(context: Context) -> str:
         return ""
     masks = context.settings.block.masks
     hidden = f"; do the masks {masks} hide them? white is used, black is ignored" if masks else ""
-    return f"; {empty} of {len(paths)} images have no keypoints{hidden}"
+    return f"; {empty} of {len(paths)} images {form(empty, 'has', 'have')} no keypoints{hidden}"
 
 
 def _to_filter(context: Context, deadline: Deadline | None) -> tuple[Context, list[StageReport]]:

@@ -25,6 +25,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.stages.timing import TriedPair, adjusting_s, duration, mean, measuring_s, page_s, tried_pair
 from aeromatch_cli.strategies.refiners import REFINERS
+from aeromatch_cli.words import form
 
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _PART = r"(\d+(?:\.\d+)?)\s*(s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?)"
@@ -249,9 +250,8 @@ def steps_in_time(context: Context, deadline: Deadline) -> list[StepContext]:
             if not _fits(step, done[0], deadline):
                 # Each step has a limit of its own, and pairs are settled that have what the last one asks for.
                 limit = f"by its limit (below_matches {every[count - 1].below_matches})"
-                deadline.left_out.append(
-                    f"{_STEP}{step.name}, which {_pairs(len(step.reasons))} would have taken {limit}"
-                )
+                asking = f"{len(step.reasons)} {form(len(step.reasons), 'pair')}"
+                deadline.left_out.append(f"{_STEP}{step.name}, which {asking} would have taken {limit}")
                 deadline.left_out += [f"{_STEP}{other.name}" for other in every[count:]]
                 break
         reports = [step.reports for step in done]
@@ -283,10 +283,6 @@ def _fits(step: StepContext, first: StepContext, deadline: Deadline) -> bool:
         return True
     rest_s = _Todo.of(context, images).seconds(tried.image_s, tried.pair_s)
     return deadline.holds(rest_s + later_s) or not deadline.is_worth(rest_s)
-
-
-def _pairs(count: int) -> str:
-    return f"{count} pair{'s' if count != 1 else ''}"
 
 
 def measured_in_time(context: Context, deadline: Deadline) -> Context:

@@ -88,9 +88,10 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             f"{source.path.name}: {disabled} {form(disabled, 'camera is', 'cameras are')} not enabled there, but used"
         )
     if 0 < used_estimated < len(rows):
+        given = len(rows) - used_estimated
         remarks.append(
-            f"{source.path.name}: {len(rows) - used_estimated} of {len(rows)} images have no estimated position there; "
-            "the given one is used"
+            f"{source.path.name}: {given} of {len(rows)} images {form(given, 'has', 'have')} no estimated position "
+            "there; the given one is used"
         )
     system = system or StatedCrs()
     if stated_one:
