@@ -163,10 +163,11 @@ def test_the_matcher_of_learned_features_guides_every_pair_and_begins_with_the_r
     assert np.array_equal(first.costs, expected_first.costs)
 
 
-@pytest.mark.parametrize(("with_places", "runs"), [(120, 1), (20, 2)])
+@pytest.mark.parametrize(("with_places", "known", "runs"), [(120, 150, 1), (20, 30, 2), (20, 10, 1)])
 def test_places_that_hide_the_matches_are_left_out(
-    monkeypatch: pytest.MonkeyPatch, with_places: int, runs: int
+    monkeypatch: pytest.MonkeyPatch, with_places: int, known: int, runs: int
 ) -> None:
+    """Where few matches agree with them, and no more than are known without the network."""
     asked: list[bool] = []
 
     def answer(inputs: Sequence[tuple[NetworkInput, NetworkInput]]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -175,11 +176,11 @@ def test_places_that_hide_the_matches_are_left_out(
         return [(np.repeat(np.arange(count), 2).reshape(-1, 2), np.full(count, 0.9))]
 
     monkeypatch.setattr(learned, "most_evident", lambda _, sets: max(sets, key=lambda one: len(one.rows)))
-    found = finished(LearnedLightGlue().by_network(compared()), answer)
+    found = finished(LearnedLightGlue().by_network(compared(), None, known), answer)
     assert asked == [True, False][:runs]
-    assert len(found.rows) == (120 if runs == 1 else 150)
+    assert len(found.rows) == (with_places if runs == 1 else 150)
     asked.clear()
-    finished(LearnedLightGlue(expect_places=False).by_network(compared()), answer)
+    finished(LearnedLightGlue(expect_places=False).by_network(compared(), None, known), answer)
     assert asked == [False]
 
 

@@ -226,7 +226,7 @@ def _times(ours: Sequence[float], theirs: Sequence[float]) -> str:
 def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("speed", __doc__)
     add = parser.add_argument
-    add("--images", type=options.numbers, default="12,6", help="of each block: one number, or one for each size")
+    add("--images", type=options.numbers, default="10,5", help="of each block: one number, or one for each size")
     add("--megapixels", type=options.numbers, default="3,12", help="comma-separated")
     add("--scenes", type=options.names, default=",".join(SCENES), help="comma-separated")
     add("--chains", type=options.names, default=",".join(CHAINS), help="presets and pycolmap, comma-separated")

@@ -43,7 +43,7 @@ METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
 # The conditions under which a strategy may help; both sections share the runs of `auto`.
 STRATEGY_PLACES = "city:mixed,city:exposed,city:oblique,grass:nadir"
 # What is open; docs/decisions.md says what others brought.
-STRATEGIES = "cascade.learned.lightglue=false,match=lightglue,enhance=shadow"
+STRATEGIES = "cascade.learned.lightglue=false,match=lightglue"
 
 
 def _rendered(section: str, arguments: Sequence[str]) -> None:
@@ -53,7 +53,7 @@ def _rendered(section: str, arguments: Sequence[str]) -> None:
     add("--places", type=options.names, default=places, metavar="SCENE:FLIGHT", help="comma-separated")
     add("--seeds", type=options.numbers, default="1,2", help="of the blocks, comma-separated")
     add("--size", metavar="WxH", default="640x480", help="of rendered images")
-    add("--images", type=options.positive, default=6, help="of each rendered block, twice as many of five cameras")
+    add("--images", type=options.positive, default=5, help="of each rendered block, twice as many of five cameras")
     about = "SIFT descriptors per image; networks have half as many"
     add("--keypoints", type=options.positive, default=4096, help=about)
     if section == "rendered":

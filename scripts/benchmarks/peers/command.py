@@ -144,7 +144,7 @@ def main(arguments: Sequence[str]) -> None:
     quick: dict[str, object] = {"pairs": 3, "keypoints": 512}
     if section == "rendered":
         scenes = "city,suburb,hills"
-        options.add_rendered(parser, scenes=scenes, pairs=6, size="800x600", images=16, flights="mixed")
+        options.add_rendered(parser, scenes=scenes, pairs=4, size="800x600", images=16, flights="mixed")
         quick |= {"scenes": "suburb", "size": "480x360", "images": 8}
     else:
         add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
