@@ -37,7 +37,7 @@ class LearnedLightGlue(Attention):
     guided: bool = guided_field(default=True)
     guide_below_matches: int = guide_below_field(_EVERY)
     network_below_matches: int = network_below_field(_EVERY)
-    # Twelve real pairs of 2,048 descriptors: 240 correct matches a pair with 0.99, 239 with 0.95 in three fifths of the
+    # Twelve real pairs of 2,048 descriptors: 240 correct matches a pair with 0.99, 239 with 0.95 in two fifths of the
     # network's seconds.
     width_confidence: float = width_field(0.95)
     expect_places: bool = Field(
