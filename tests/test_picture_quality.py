@@ -164,7 +164,7 @@ def test_blurred_pictures_are_named_before_the_long_stages_and_left_out_where_as
     assert len(figures) == len(names)
     assert max(figures, key=lambda key: figures[key].blur)[0].startswith(Path(names[3]).stem)
     said = site("pairs", "--set", "orient=none", "--exclude", names[3])
-    assert f"1 of {len(names)} images ({names[3]}) are left out, as --exclude asks" in said.stderr
+    assert f"1 of {len(names)} images ({names[3]}) is left out, as --exclude asks" in said.stderr
     assert "blurred" not in said.stderr
     assert len(read_picture_quality(site.work / "images.csv")) == len(names) - 1
 
