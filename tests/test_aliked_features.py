@@ -148,4 +148,4 @@ def test_the_step_learned_takes_published_features_with_their_matcher() -> None:
 def test_matchers_take_the_descriptors_that_they_know() -> None:
     assert load("oblique", ["extract=aliked", "match=lightglue-aliked"]).match.reads_descriptors == "ALIKED"
     with pytest.raises(ConfigError, match="compares GeoDesc descriptors, extract aliked makes ALIKED"):
-        load("oblique", ["extract=aliked"])
+        load("oblique", ["extract=aliked", "match=lightglue-learned"])

@@ -81,11 +81,13 @@ def _learned(step: LearnedFeatures, settings: Settings) -> dict[str, Strategy]:
     """Learned features and what matches them."""
     keypoints, reduction = keypoints_of(step, settings), _reduction(settings)
     network = {"precision": step.precision, "device": step.device}
-    neighbours = Bidirectional(ratio=0.9, guided=True)
+    matcher: Strategy = Bidirectional(ratio=0.9, guided=True)
     if step.features == "aliked":
-        matcher = AlikedLightGlue(**network) if step.lightglue else neighbours
+        if step.lightglue:
+            matcher = AlikedLightGlue(**network)
         return {"extract": Aliked(keypoints=keypoints, **reduction), "match": matcher}
-    matcher = LearnedLightGlue(**network) if step.lightglue else neighbours
+    if step.lightglue:
+        matcher = LearnedLightGlue(**network)
     return {"extract": Learned(keypoints=keypoints, **network, **reduction), "match": matcher}
 
 
