@@ -80,8 +80,8 @@ def test_other_strategies_in_default_yaml_are_valid_when_uncommented() -> None:
                 tree["extract"] = {"name": "sift", "colours": True}  # and one reads colours
             if key == "extract" and tree[key]["name"] == "grid":
                 tree["match"] = {"name": "polar"}  # nothing else can compare what has no descriptors
-            if key == "match" and tree[key]["name"] == "lightglue-learned":
-                tree["extract"] = {"name": "learned"}  # its network knows no others
+            if key == "match" and tree[key]["name"] in ("lightglue-learned", "lightglue-aliked"):
+                tree["extract"] = {"name": tree[key]["name"].removeprefix("lightglue-")}  # it knows no others
             settings = validate(tree)
             strategy = getattr(settings, key)[0] if isinstance(tree[key], list) else getattr(settings, key)
             assert strategy == type(strategy)()

@@ -210,7 +210,7 @@ def _add_weights(
 WEIGHTS: Mapping[str, tuple[str, Callable[..., None]]] = {
     "list": ("List the network weights of the package and of the weights folder.", _list_weights),
     "verify": ("Compare every weights file with its recorded SHA-256.", _verify_weights),
-    "add": ("Check a LightGlue weights file and copy it into the weights folder.", _add_weights),
+    "add": ("Check a weights file of LightGlue or ALIKED and copy it into the weights folder.", _add_weights),
 }
 
 

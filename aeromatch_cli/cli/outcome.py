@@ -144,6 +144,7 @@ class Weights(Line):
     command: Literal["weights list", "weights verify", "weights add"]
     weights: list[str] | dict[str, str] | None = Field(None, description="Names in the folder; verify: name -> state.")
     shipped: list[str] | dict[str, str] | None = Field(None, description="The same of those of the package.")
+    packages: list[str] | None = Field(None, description="Published ones that installed packages hold.")
     name: str | None = Field(None, description="Of the file that was added.")
 
 

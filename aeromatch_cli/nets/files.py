@@ -26,7 +26,7 @@ SUFFIXES = (".safetensors", ".pth", ".pt")
 class WeightsEntry:
     """A file of the weights folder as it was when it was added, or one that ships.
 
-    architecture: the network's, such as "lightglue", which is the only one that can be added.
+    architecture: the network's; "lightglue" and "aliked" can be added.
     """
 
     name: str
@@ -47,6 +47,14 @@ def sha256_of_file(path: Path) -> str:
     """Hexadecimal SHA-256 of a file's content."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def content_stamp(path: Path) -> tuple[int, int] | None:
+    """Size and time of a file's last change, None where it is missing: what tells a replaced file apart."""
+    if not path.is_file():
+        return None
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
 def shipped_path(name: str) -> Path:
@@ -116,6 +124,8 @@ def _checked_tensors(path: Path, content: Any) -> dict[str, Tensor]:
 
     if not isinstance(content, Mapping) or not content:
         raise ConfigError(f"weights file {path} holds no named tensors; export the network's state dict")
+    # Batch norms count what they were trained with, in integers, and compute with it only while they are trained.
+    content = {name: value for name, value in content.items() if not str(name).endswith(".num_batches_tracked")}
     for name, value in content.items():
         if not isinstance(name, str) or not isinstance(value, torch.Tensor):
             raise ConfigError(f"weights file {path}: entry {name!r} is not a tensor; export the network's state dict")
@@ -123,4 +133,4 @@ def _checked_tensors(path: Path, content: Any) -> dict[str, Tensor]:
             raise ConfigError(f"weights file {path}: tensor {name} is of type {value.dtype}; export floating point")
         if not bool(torch.isfinite(value).all()):
             raise ConfigError(f"weights file {path}: tensor {name} holds NaN or infinity; the file is damaged")
-    return dict(content)
+    return content

@@ -115,7 +115,13 @@ def _write_index(folder: Path, entries: Mapping[str, WeightsEntry]) -> None:
 
 
 def _architecture(path: Path) -> str:
+    from aeromatch_cli.nets.aliked import AlikedNetwork, is_aliked
+    from aeromatch_cli.nets.files import read_tensors
     from aeromatch_cli.nets.lightglue_file import load_lightglue
 
+    tensors = read_tensors(path)
+    if is_aliked(tensors):
+        AlikedNetwork(tensors)
+        return "aliked"
     load_lightglue(path)
     return "lightglue"

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.files import read_tensors
+from aeromatch_cli.nets.files import content_stamp, read_tensors
 from aeromatch_cli.nets.precision import Precision, layer_type
 
 _MAX_NAMED = 3
@@ -36,14 +36,6 @@ def once_per_file(load: Callable[P, R]) -> Callable[P, R]:
         return cached(content_stamp(path) if isinstance(path, Path) else None, args, tuple(sorted(kwargs.items())))
 
     return loader
-
-
-def content_stamp(path: Path) -> tuple[int, int] | None:
-    """Size and time of a file's last change, None where it is missing: what tells a replaced file apart."""
-    if not path.is_file():
-        return None
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns
 
 
 def load_network(

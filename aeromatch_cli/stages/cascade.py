@@ -27,11 +27,13 @@ from aeromatch_cli.stages.pair_statistics import PairStatistics
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.extractors.aliked import Aliked
 from aeromatch_cli.strategies.extractors.described import Described
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.strategies.matchers.descriptors.search import EVERY_PAIR
+from aeromatch_cli.strategies.matchers.lightglue.aliked import AlikedLightGlue
 from aeromatch_cli.strategies.matchers.lightglue.learned import LearnedLightGlue
 from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
 from aeromatch_cli.strategies.simulators.plane import PlaneViews
@@ -78,24 +80,27 @@ def _views(settings: Settings) -> NeighbourViews:
     return NeighbourViews(far_ground=own.far_ground) if isinstance(own, PlaneViews) else NeighbourViews()
 
 
+def _learned(step: LearnedFeatures, settings: Settings) -> dict[str, Strategy]:
+    """Learned features and what matches them."""
+    keypoints, reduction = keypoints_of(step, settings), _reduction(settings)
+    network = {"precision": step.precision, "device": step.device}
+    matcher: Strategy = Bidirectional(ratio=0.9, guided=True)
+    if step.features == "aliked":
+        if step.lightglue:
+            matcher = AlikedLightGlue(**network, max_keypoints=_SHOWN)
+        return {"extract": Aliked(keypoints=keypoints, **reduction), "match": matcher}
+    if step.lightglue:
+        matcher = LearnedLightGlue(**network, max_keypoints=_SHOWN)
+    return {"extract": Learned(keypoints=keypoints, **network, **reduction), "match": matcher}
+
+
 # What a step changes of the settings.
 _SETTINGS_OF: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = {
     GuidedSearch: lambda _, settings: {
         # The step has decided: guided search, however many matches there are.
         "match": settings.match.model_copy(update={"guided": True, "guide_below_matches": EVERY_PAIR}),
     },
-    LearnedFeatures: lambda step, settings: {
-        "simulate": _views(settings),
-        "extract": Learned(
-            keypoints=keypoints_of(step, settings),
-            precision=step.precision,
-            device=step.device,
-            **_reduction(settings),
-        ),
-        "match": LearnedLightGlue(precision=step.precision, device=step.device, max_keypoints=_SHOWN)
-        if step.lightglue
-        else Bidirectional(ratio=0.9, guided=True),
-    },
+    LearnedFeatures: lambda step, settings: {"simulate": _views(settings), **_learned(step, settings)},
 }
 
 

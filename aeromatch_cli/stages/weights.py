@@ -9,7 +9,7 @@ from aeromatch_cli.stages.command_result import Result
 
 def manage_weights(action: str, path: str | None) -> Result:
     """List, verify or add network weights; a file that does not match its record is a failure."""
-    from aeromatch_cli.nets import files, folder
+    from aeromatch_cli.nets import files, folder, published
 
     if action == "add":
         entry = folder.add_weights(Path(path or ""))
@@ -23,9 +23,16 @@ def manage_weights(action: str, path: str | None) -> Result:
         facts = {"weights": {c.name: c.state for c in checks}, "shipped": {c.name: c.state for c in ships}}
         return Result(lines, facts, wrong)
     entries, shipped = folder.list_weights(), files.shipped_weights()
-    table = [(e, "  (ships, used without a setting)") for e in shipped] + [(e, "") for e in entries]
+    others = published.in_packages()
+    table = [(e, "  (ships, used without a setting)") for e in shipped]
+    table += [(e, f"  ({terms})" if (terms := published.terms_of(e.sha256)) else "") for e in entries]
+    table += [(e, f"  ({published.terms_of(e.sha256) or 'not as published'}; in an installed package)") for e in others]
     listed = tuple(f"{e.name}  {e.architecture}  {e.size_bytes / 1e3:,.0f} kB  {e.sha256}{note}" for e, note in table)
     return Result(
         (*listed, *(() if entries else (nothing,))),
-        {"weights": [e.name for e in entries], "shipped": [e.name for e in shipped]},
+        {
+            "weights": [e.name for e in entries],
+            "shipped": [e.name for e in shipped],
+            "packages": [e.name for e in others],
+        },
     )

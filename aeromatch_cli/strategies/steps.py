@@ -98,6 +98,11 @@ class LearnedFeatures(Step):
         "expected to bring this share more matches (0.7: 70 %). Larger: fewer pairs take it, less time; 100: none.",
     )
     keypoints: int | None = _KEYPOINTS
+    features: Literal["own", "aliked"] = Field(
+        "own",
+        description="Features of the package's own networks, or of ALIKED, which others have published "
+        "(`aeromatch weights list` says whether its weights are there), with the LightGlue that belongs to them.",
+    )
     lightglue: bool = Field(
         True,
         description="Match the step's features by LightGlue, which is told where the poses expect each keypoint, as "
@@ -107,9 +112,14 @@ class LearnedFeatures(Step):
     device: Device = DEVICE
 
     def check_files(self, descriptor_length: int) -> None:
-        """The device is looked for."""
+        """The device is looked for, and published weights. Raises ConfigError where one is missing."""
         super().check_files(descriptor_length)
         check_device(self.device)
+        if self.features == "aliked":
+            from aeromatch_cli.nets.published import published_path
+
+            for name in ("aliked-n16rot", *(["aliked_lightglue"] if self.lightglue else [])):
+                published_path(name)
 
 
 STEPS: Mapping[str, type[Step]] = {"guided": GuidedSearch, "learned": LearnedFeatures}

@@ -10,12 +10,11 @@ from aeromatch_cli.fingerprints import file_digest, fingerprint
 
 # Source that answers depend on, below the package or scripts. Peers read no more of the package than lens models.
 PEER_CODE = (
-    "geometry/cameras.py", "geometry/frames.py", "benchmarks/processes.py",
+    "geometry/cameras.py", "geometry/frames.py", "nets/aliked.py", "benchmarks/processes.py",
     *(
         f"benchmarks/peers/{name}.py"
         for name in (
-            "aliked", "aliked_network", "base", "colmap", "kornia_peers", "matching", "opencv", "published",
-            "superpoint",
+            "aliked", "base", "colmap", "kornia_peers", "matching", "opencv", "published", "superpoint",
         )
     ),
 )  # fmt: skip

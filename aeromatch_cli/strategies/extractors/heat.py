@@ -59,7 +59,7 @@ def heat_keypoints(
     seen = None if valid is None or bool(valid.all()) else valid.astype(np.float32)
     maps = [heat(level.gray, network, shown=_shown(level, seen)) for level in levels]
     points, sizes, logits = maxima(levels, maps)
-    inside = _within(valid, points, sizes)
+    inside = inside_shown(valid, points, sizes)
     points, sizes, logits = points[inside], sizes[inside], logits[inside]
     ranks = logits - _FINER * 2.0 * np.log2(sizes / SIZE_PX)
     order = np.lexsort((points[:, 0], points[:, 1], sizes, -ranks))
@@ -167,7 +167,7 @@ def _nearest(values: NDArray[Any], points_px: FloatArray) -> NDArray[Any]:
     return values[np.clip(rows, 0, values.shape[0] - 1), np.clip(columns, 0, values.shape[1] - 1)]
 
 
-def _within(valid: BoolArray | None, points_px: FloatArray, sizes_px: FloatArray) -> BoolArray:
+def inside_shown(valid: BoolArray | None, points_px: FloatArray, sizes_px: FloatArray) -> BoolArray:
     """Which keypoints (N,) lie farther than their size inside what the picture shows: a mask's edge is no texture.
 
     Their patches, of more than three sizes to either side, may reach over it.

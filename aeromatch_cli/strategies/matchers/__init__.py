@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
+from aeromatch_cli.strategies.matchers.lightglue.aliked import AlikedLightGlue
 from aeromatch_cli.strategies.matchers.lightglue.learned import LearnedLightGlue
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.strategies.matchers.polar import Polar
@@ -16,5 +17,6 @@ MATCHERS: Mapping[str, type[Strategy]] = {
     "bidirectional": Bidirectional,
     "lightglue": LightGlue,
     "lightglue-learned": LearnedLightGlue,
+    "lightglue-aliked": AlikedLightGlue,
     "polar": Polar,
 }

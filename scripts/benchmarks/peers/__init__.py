@@ -3,7 +3,7 @@
 base      what a method is given and what it answers; pictures and weights of peers
 matching  nearest neighbours and MAGSAC++, as users of OpenCV and kornia call them
 opencv, colmap, aliked, kornia_peers, superpoint   the peers; published: some of them with a published LightGlue
-aliked_network   ALIKED's layers; ground: any peer on rectified views
+ground    any peer on rectified views
 ours      a preset of this project
 table     name -> method
 worker    one method on one scene in a process of its own; its answers on disk

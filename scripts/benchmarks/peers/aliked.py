@@ -18,7 +18,7 @@ class Aliked(Peer):
     ratio = None
 
     def __init__(self, scene: Scene, options: Options, *, model: str = ALIKED_ROTATED) -> None:
-        from benchmarks.peers.aliked_network import AlikedNetwork
+        from aeromatch_cli.nets.aliked import AlikedNetwork
 
         super().__init__(scene, options)
         self.network = AlikedNetwork(read_weights(options, f"{model}.pth"))

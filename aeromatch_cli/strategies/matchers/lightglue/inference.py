@@ -137,7 +137,7 @@ class NetworkOptions:
 
 def loaded_network(wanted: NetworkOptions) -> LoadedNetwork:
     """The network, built once per process and read anew where the file was replaced."""
-    from aeromatch_cli.nets.loading import content_stamp
+    from aeromatch_cli.nets.files import content_stamp
 
     return _loaded(wanted, content_stamp(Path(wanted.path)))
 

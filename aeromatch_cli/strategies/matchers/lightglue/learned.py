@@ -11,12 +11,10 @@ from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison,
 from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
 from aeromatch_cli.strategies.matchers.descriptors.search import Steps, guide_below_field, guided_field
 from aeromatch_cli.strategies.matchers.lightglue.inference import NetworkInput, with_expected_places
-from aeromatch_cli.strategies.matchers.lightglue.matcher import Attention, network_below_field, width_field
+from aeromatch_cli.strategies.matchers.lightglue.matcher import EVERY, Attention, network_below_field, width_field
 
 # Learned descriptors are less alike than those of SIFT: as in the preset oblique.
 _RATIO = 0.9
-# Every pair is guided and shown to the network, which finds more in easy ones as well.
-_EVERY = 100_000
 # With places half a picture off, or turned by 90 degrees, 13 and 93 matches of a pair of ochota agree with one pose;
 # with right places 805. A hard pair has few with right places, too, and more than without the network.
 _FEW = 100
@@ -35,8 +33,8 @@ class LearnedLightGlue(Attention):
     signed: ClassVar[bool] = True
     name: Literal["lightglue-learned"] = "lightglue-learned"
     guided: bool = guided_field(default=True)
-    guide_below_matches: int = guide_below_field(_EVERY)
-    network_below_matches: int = network_below_field(_EVERY)
+    guide_below_matches: int = guide_below_field(EVERY)
+    network_below_matches: int = network_below_field(EVERY)
     # Twelve real pairs of 2,048 descriptors: 240 correct matches a pair with 0.99, 239 with 0.95 in two fifths of the
     # network's seconds.
     width_confidence: float = width_field(0.95)

@@ -33,6 +33,8 @@ from aeromatch_cli.strategies.matchers.lightglue.inference import (
 
 # Smallest cost of matches that the network did not find; those of the network have 1 - probability.
 _DOUBTFUL = 0.7
+# More than a pair has: every pair is guided and shown to the network, which finds more in easy ones as well.
+EVERY = 100_000
 # The network's matches above these probabilities are tried as well: on unusual ground it is overconfident.
 _SURER = (0.3, 0.5, 0.8)
 
@@ -67,7 +69,7 @@ class Attention(Search):
     """
 
     network: ClassVar[bool] = True
-    shipped: ClassVar[str]
+    shipped: ClassVar[str] = ""
     signed: ClassVar[bool] = False
     name: str
     network_below_matches: int = network_below_field(250)
@@ -114,12 +116,15 @@ class Attention(Search):
 
     def fingerprint_files(self) -> tuple[str, ...]:
         """Path of the file whose SHA-256 belongs to the fingerprint. Raises ConfigError where it is missing."""
-        from aeromatch_cli.nets.files import shipped_path
         from aeromatch_cli.nets.folder import resolve_weights
 
-        if self.weights is not None:
-            return (str(resolve_weights(self.weights)),)
-        return (str(shipped_path(self.shipped)),)
+        return (str(self.usual_path() if self.weights is None else resolve_weights(self.weights)),)
+
+    def usual_path(self) -> Path:
+        """The file without the setting `weights`: one that ships."""
+        from aeromatch_cli.nets.files import shipped_path
+
+        return shipped_path(self.shipped)
 
     def check_files(self, descriptor_length: int) -> None:
         """Loads the user's own weights once. Those of the package are checked by `aeromatch weights verify`."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import torch
@@ -24,6 +25,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.files import read_tensors
+from aeromatch_cli.nets.loading import once_per_file
 
 # Pictures are filled up to multiples of this: the coarsest maps have one value for so many pixels.
 MULTIPLE_PX = 32
@@ -59,6 +62,11 @@ class Maps:
     left: int
     top: int
     scores: Tensor
+
+
+def is_aliked(tensors: Mapping[str, Tensor]) -> bool:
+    """Whether a file of weights is one of ALIKED's, going by a name that no other network has."""
+    return "desc_head.agg_weights" in tensors
 
 
 class AlikedNetwork:
@@ -204,6 +212,12 @@ class AlikedNetwork:
         x, y = pixels[:, 0] + maps.left, pixels[:, 1] + maps.top
         own = F.selu_(maps.full[y, x] @ self.tensors["conv1.weight"][:, :, 0, 0].T)
         return F.normalize(torch.cat([own, *(_between(part, maps.full, x, y) for part in maps.parts)], 1), dim=1)
+
+
+@once_per_file
+def load_aliked(path: Path) -> AlikedNetwork:
+    """The network of a weights file. Raises ConfigError where that is none of ALIKED's."""
+    return AlikedNetwork(read_tensors(path))
 
 
 def _folded(tensors: Mapping[str, Tensor], layer: str, norm: str) -> tuple[Tensor, Tensor]:

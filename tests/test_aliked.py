@@ -1,4 +1,4 @@
-"""ALIKED's network of the benchmarks beside kornia's, with the same random weights."""
+"""ALIKED's network beside kornia's, with the same random weights."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from benchmarks.peers import aliked_network
-from benchmarks.peers.aliked_network import AlikedNetwork
 from scipy.spatial import cKDTree
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets import aliked
+from aeromatch_cli.nets.aliked import AlikedNetwork
 
 MOST = 60
 
@@ -39,7 +39,7 @@ def picture(width: int, height: int) -> torch.Tensor:
 @pytest.mark.parametrize("size", [(133, 150), (64, 96)])
 def test_numbers_are_kornias(theirs: Any, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]) -> None:
     """In pieces, too, and where the picture is filled up on all sides."""
-    monkeypatch.setattr(aliked_network, "PIECE_PX", 40)
+    monkeypatch.setattr(aliked, "PIECE_PX", 40)
     colour = picture(*size)
     own = AlikedNetwork(theirs.state_dict())
     maps = own.maps(colour)

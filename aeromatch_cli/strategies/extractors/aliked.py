@@ -1,0 +1,126 @@
+"""ALIKED's keypoints and descriptors on every view of an image, with the weights that its authors have published.
+
+Source: Zhao et al., ALIKED: a lighter keypoint and descriptor extraction network via deformable transformation, IEEE
+Transactions on Instrumentation and Measurement 72, 2023.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.nets.descriptor_bytes import as_bytes
+from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.described import Described, pixels_field
+from aeromatch_cli.strategies.extractors.detection import Raw
+from aeromatch_cli.strategies.extractors.heat import inside_shown
+
+# Keypoints of a view that the even spread chooses from, for each that it may keep.
+_CHOICE = 8
+# Diameter of a keypoint, pixels: the network looks at pictures of one scale. As large as the finest of `learned`.
+_SIZE_PX = 7.5
+# Pixels of pictures whose maps are held, about 100 bytes each.
+_HELD_PX = 4_000_000
+
+
+class _Looks:
+    """What the network saw of the pictures at hand: found for their keypoints, read again for the descriptors."""
+
+    def __init__(self) -> None:
+        self._held: list[tuple[NDArray[Any], Any]] = []
+
+    def of(self, network: Any, gray: NDArray[Any]) -> Any:
+        """Of a picture (H, W), gray as all views are, for the three colours."""
+        import torch
+
+        for known, maps in self._held:
+            if known is gray:
+                return maps
+        values = torch.from_numpy(np.ascontiguousarray(gray)).float() / 255.0
+        self._held.append((gray, network.maps(values.expand(3, -1, -1))))
+        while len(self._held) > 1 and sum(known.size for known, _ in self._held) > _HELD_PX:
+            self._held.pop(0)
+        return self._held[-1][1]
+
+
+_LOOKS = _Looks()
+
+
+class Aliked(Described):
+    """ALIKED, a network that others have published. Its weights are found in an installed package or in the weights
+    folder (`aeromatch weights list`); without them the strategy is refused."""
+
+    version: ClassVar[int] = 1
+    network: ClassVar[bool] = True
+    descriptors: ClassVar[str] = "ALIKED"
+    name: Literal["aliked"] = "aliked"
+    pixels_per_keypoint: float = pixels_field(1500.0)
+    model: Literal["n16rot", "n16"] = Field(
+        "n16rot", description="Which of the published networks: n16rot was trained with pictures that are turned."
+    )
+
+    @property
+    def north_up_only(self) -> bool:
+        """Descriptors follow the picture's rows: views with north up match no others."""
+        return True
+
+    def fingerprint_files(self) -> tuple[str, ...]:
+        """The published file. Raises ConfigError where it is not there."""
+        return (str(self._path()),)
+
+    def _path(self) -> Path:
+        from aeromatch_cli.nets.published import published_path
+
+        return published_path(f"aliked-{self.model}")
+
+    def _network(self) -> Any:
+        from aeromatch_cli.nets.aliked import load_aliked
+
+        return load_aliked(self._path())
+
+    def detected(self, view: ViewPixels, view_idx: int) -> Raw:
+        """The strongest maxima of the score map."""
+        network = self._network()
+        points, scores = network.keypoints(_LOOKS.of(network, view.gray), _CHOICE * self.keypoints)
+        points_px, strengths = points.numpy().astype(np.float32), scores.numpy().astype(np.float32)
+        sizes = np.full(len(points_px), _SIZE_PX, np.float32)
+        shown = inside_shown(view.valid, points_px.astype(np.float64), sizes)
+        points_px, strengths, sizes = points_px[shown], strengths[shown], sizes[shown]
+        return Raw(
+            source_px=points_px.astype(np.float64),
+            source_sizes_px=sizes,
+            points_px=points_px,
+            sizes_px=sizes,
+            orientations_deg=np.zeros(len(points_px), np.float32),
+            responses=strengths,
+            octaves=np.zeros(len(points_px), np.int32),
+            view_idx=np.full(len(points_px), view_idx, np.int32),
+        )
+
+    def suffice(self, raw: Raw, factor: int) -> bool:
+        """Always, as of `learned`: the surest keypoints of finer views match none of the other images."""
+        del raw, factor
+        return True
+
+    def strengths(self, raw: Raw) -> FloatArray:
+        """The network's scores."""
+        return raw.responses
+
+    def described(self, raw: Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
+        """Descriptor bytes (N, 128), see `as_bytes`."""
+        import torch
+
+        network = self._network()
+        found = np.zeros((len(raw.view_idx), self.descriptor_length), np.float32)
+        for view_idx, view in enumerate(views):
+            of_view = np.flatnonzero(raw.view_idx == view_idx)
+            if len(of_view):
+                points = torch.from_numpy(raw.points_px[of_view].astype(np.float32))
+                found[of_view] = network.descriptors(_LOOKS.of(network, view.gray), points).numpy()
+        return as_bytes(found)
