@@ -49,7 +49,8 @@ _RARE = 0.02
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
 # The strongest descriptors of a view that LightGlue compares: two rendered city blocks, and every 3rd and 4th image of
-# lewis and ochota, have as many correct matches and points with twice as many (99 to 101 %), in twice the seconds.
+# lewis and ochota, have 99 to 101 % of the correct matches and points that twice as many bring. Seconds grow with the
+# square.
 _SHOWN = 1024
 # An image that no step has tied yet may show another place. So many partners, those with most matches, tell.
 _TRIED_PARTNERS = 3
