@@ -111,7 +111,6 @@ def limits_of(recipe: BlockConsistency) -> Limits:
         recipe.third_image_px,
         recipe.min_probability,
         recipe.min_expected_right,
-        recipe.raised_up_to,
         recipe.min_matches,
     )
 

@@ -48,13 +48,6 @@ class BlockConsistency(Strategy):
         "probable ones are dropped as well, until this share is reached. 0 = none. Larger: fewer matches, fewer of "
         "them wrong.",
     )
-    raised_up_to: float = Field(
-        0.97,
-        ge=0.0,
-        lt=1.0,
-        description="Matches that are at least as likely to be right as this stay, whatever min_expected_right asks "
-        "for: images that no third one overlaps have few that are surer. Larger: fewer matches, fewer of them wrong.",
-    )
     min_matches: int = Field(
         15,
         ge=1,

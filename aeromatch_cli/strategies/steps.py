@@ -83,7 +83,7 @@ class LearnedFeatures(Step):
     Views are halved as by `extract=learned` itself, but never where `extract.pixels_per_keypoint` is 0.
     """
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 2
     cheap_to_match: ClassVar[bool] = True
     expectation_weights: ClassVar[tuple[float, ...] | None] = (0.989, 0.852, -0.348, -0.018, 0.449)
     name: Literal["learned"] = "learned"
@@ -104,9 +104,9 @@ class LearnedFeatures(Step):
         "(`aeromatch weights list` says whether its weights are there), with the LightGlue that belongs to them.",
     )
     lightglue: bool = Field(
-        True,
+        False,
         description="Match the step's features by LightGlue, which is told where the poses expect each keypoint, as "
-        "well as by nearest neighbours. false: fewer matches of difficult pairs, half a second less per pair.",
+        "well as by nearest neighbours. More matches of difficult pairs; half a second more per pair.",
     )
     precision: Precision = _PRECISION
     device: Device = DEVICE

@@ -41,9 +41,8 @@ from benchmarks.tables import Row, write_rows
 
 METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
 # The conditions under which a strategy may help; both sections share the runs of `auto`.
-STRATEGY_PLACES = "city:mixed,city:exposed,city:oblique,grass:nadir"
-# What is open; docs/decisions.md says what others brought.
-STRATEGIES = "cascade.learned.lightglue=false,match=lightglue,enhance=shadow"
+STRATEGY_PLACES = "city:mixed,city:exposed,city:oblique,grass:nadir,farmland:nadir"
+STRATEGIES = "filter=epipolar+graph,filter=clustered-ransac+epipolar,match=lightglue,enhance=shadow,simulate=neighbours"
 
 
 def _rendered(section: str, arguments: Sequence[str]) -> None:
