@@ -104,7 +104,7 @@ def test_a_lost_serial_number_splits_no_camera() -> None:
     other = replace(one, camera_serial="0K8B")
     found = cameras_from_exif({"1": one, "2": stripped, "3": other}, {})
     assert len(found.cameras) == 3
-    assert "1 of 3 images (2) have no serial number, and others of the same model have several" in found.warnings[0]
+    assert "1 of 3 images (2) has no serial number, and others of the same model have several" in found.warnings[0]
     # Another size, or another folder's camera, tells nothing.
     small = replace(stripped, width_px=20, height_px=15)
     found = cameras_from_exif({"1": one, "2": small}, {})

@@ -11,6 +11,7 @@ from conftest import QUICK, UNORIENTED, Outcome, Site, invoke
 from read_pages import ROOT, commands, text_of
 
 from aeromatch_cli.cli.look_commands import LOOK
+from aeromatch_cli.nets import published
 
 pytestmark = pytest.mark.slow
 SETTINGS = UNORIENTED
@@ -81,6 +82,8 @@ def test_the_command_runs(command: str, request: pytest.FixtureRequest, monkeypa
     finished = command.split()[1] in READ_A_WORKSPACE
     site: Site = request.getfixturevalue("done_site" if finished else "site")
     monkeypatch.chdir(site.root)
+    monkeypatch.setenv("XDG_DATA_HOME", str(site.root / "no-data"))
+    monkeypatch.setattr(published, "_PACKAGE", "no_such_package_is_installed")
     words = quick(on_the_site(command, site), site)
     known = tuple(word.replace(str(site.root), "") for word in words)
     if known not in outcomes:
@@ -88,6 +91,10 @@ def test_the_command_runs(command: str, request: pytest.FixtureRequest, monkeypa
             assert invoke(earlier, *words[1:]).code == 0
         outcomes[known] = invoke(*words)
     outcome = outcomes[known]
+    if "aliked" in command:  # weights of other people, which are not here
+        assert outcome.code == 2
+        assert "are no part of aeromatch" in outcome.stderr
+        return
     assert outcome.code == 0, outcome.stderr
     assert outcome.stdout or "--quiet" in words
 

@@ -287,7 +287,7 @@ def test_a_pair_uses_the_pictures_that_agree(same_light, both_enhanced):
 
 
 def test_the_table_names_its_classes():
-    assert set(MATCHERS) == {"nearest", "bidirectional", "lightglue", "lightglue-learned", "polar"}
+    assert set(MATCHERS) == {"nearest", "bidirectional", "lightglue", "lightglue-learned", "lightglue-aliked", "polar"}
     assert all(MATCHERS[name].model_fields["name"].default == name for name in MATCHERS)
 
 

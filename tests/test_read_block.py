@@ -63,7 +63,7 @@ def test_results_of_an_earlier_project_among_the_images_are_named(tmp_path: Path
     profile = {"driver": "GTiff", "width": 64, "height": 48, "count": 1, "dtype": "float32"}
     with rasterio.open(tmp_path / "dem.tif", "w", transform=rasterio.Affine(0.5, 0, 9, 0, -0.5, 8), **profile) as out:
         out.write(np.ones((48, 64), np.float32), 1)
-    said = "1 of 2 images (dem.tif) are georeferenced (GeoTIFF)"
+    said = "1 of 2 images (dem.tif) is georeferenced (GeoTIFF)"
     assert any(warning.startswith(said) for warning in read_inputs(tmp_path).warnings)
     assert not any("georeferenced" in warning for warning in read_inputs(tmp_path / "images").warnings)
 
@@ -206,7 +206,7 @@ def test_one_bad_image_never_stops_the_rest(tmp_path: Path) -> None:
         "._good.jpg",
         "2 of 5 images (noposition.jpg, zero.jpg) have no GPS",
         "no angles",
-        "1 of 5 images (noaltitude.jpg) have a position without height: a level flight at ",
+        "1 of 5 images (noaltitude.jpg) has a position without height: a level flight at ",
     ):
         assert words in text
     assert "(0, 0): no fix" in text

@@ -23,6 +23,7 @@ from aeromatch_cli.errors import BrokenFileError, ConfigError, WorkspaceError
 from aeromatch_cli.files import read_json, remove_stale_temporaries, write_atomically, write_json, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint, image_fingerprint, stable_hash
 from aeromatch_cli.formats.features import write_features
+from aeromatch_cli.nets import published
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.workspace import FORMAT_VERSION, Workspace
 
@@ -262,7 +263,11 @@ def test_fingerprint_feels_every_field(changed: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", [f"{family}.{name}" for family, table in FAMILIES.items() for name in table])
-def test_fingerprint_feels_every_field_of_every_strategy(name: str, tmp_path: Path) -> None:
+def test_fingerprint_feels_every_field_of_every_strategy(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "published.pth").write_bytes(b"")
+    monkeypatch.setattr(published, "published_path", lambda _: tmp_path / "published.pth")
     family, _, key = name.partition(".")
     default = FAMILIES[family][key]()
     if "weights" in type(default).model_fields:  # a folder of files, or one file; "other" does not exist
