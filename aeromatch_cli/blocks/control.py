@@ -88,7 +88,7 @@ def read_control(
             f"{count} {form(len(unseen), 'is', 'are')} measured in no image of the block: left out: {listed(unseen)}"
         )
     if measured:
-        what = f"{len(measured)} point{'s' if len(measured) > 1 else ''} without coordinates"
+        what = f"{len(measured)} {form(len(measured), 'point')} without coordinates"
         remarks.append(f"{survey.measured_in.name} measures {what} in images: left out: {listed(measured)}")
     surveyed = [point.position[2] for point in survey.points]
     if len(surveyed) >= _ZEROS and not any(surveyed):

@@ -88,9 +88,13 @@ def _found(file: str) -> Path | None:
 
 
 def _folders() -> list[Path]:
-    """Of the package, where it is installed."""
-    spec = find_spec(_PACKAGE)
-    return [] if spec is None else [Path(place) / _BELOW for place in spec.submodule_search_locations or ()]
+    return folders_in(_PACKAGE, _BELOW)
+
+
+def folders_in(package: str, below: str) -> list[Path]:
+    """Folders `below` a package, where it is installed. It is not imported for that."""
+    spec = find_spec(package)
+    return [] if spec is None else [Path(place) / below for place in spec.submodule_search_locations or ()]
 
 
 @lru_cache

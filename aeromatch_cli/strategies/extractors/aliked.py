@@ -19,12 +19,10 @@ from aeromatch_cli.nets.descriptor_bytes import as_bytes
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.described import Described, pixels_field
 from aeromatch_cli.strategies.extractors.detection import Raw
-from aeromatch_cli.strategies.extractors.heat import inside_shown
+from aeromatch_cli.strategies.extractors.heat import SIZE_PX, inside_shown
 
 # Keypoints of a view that the even spread chooses from, for each that it may keep.
 _CHOICE = 8
-# Diameter of a keypoint, pixels: the network looks at pictures of one scale. As large as the finest of `learned`.
-_SIZE_PX = 7.5
 # Pixels of pictures whose maps are held, about 100 bytes each.
 _HELD_PX = 4_000_000
 
@@ -33,20 +31,20 @@ class _Looks:
     """What the network saw of the pictures at hand: found for their keypoints, read again for the descriptors."""
 
     def __init__(self) -> None:
-        self._held: list[tuple[NDArray[Any], Any]] = []
+        self._held: list[tuple[Any, NDArray[Any], Any]] = []
 
     def of(self, network: Any, gray: NDArray[Any]) -> Any:
         """Of a picture (H, W), gray as all views are, for the three colours."""
         import torch
 
-        for known, maps in self._held:
-            if known is gray:
+        for asked, known, maps in self._held:
+            if asked is network and known is gray:
                 return maps
         values = torch.from_numpy(np.ascontiguousarray(gray)).float() / 255.0
-        self._held.append((gray, network.maps(values.expand(3, -1, -1))))
-        while len(self._held) > 1 and sum(known.size for known, _ in self._held) > _HELD_PX:
+        self._held.append((network, gray, network.maps(values.expand(3, -1, -1))))
+        while len(self._held) > 1 and sum(known.size for _, known, _ in self._held) > _HELD_PX:
             self._held.pop(0)
-        return self._held[-1][1]
+        return self._held[-1][2]
 
 
 _LOOKS = _Looks()
@@ -88,20 +86,11 @@ class Aliked(Described):
         """The strongest maxima of the score map."""
         network = self._network()
         points, scores = network.keypoints(_LOOKS.of(network, view.gray), _CHOICE * self.keypoints)
-        points_px, strengths = points.numpy().astype(np.float32), scores.numpy().astype(np.float32)
-        sizes = np.full(len(points_px), _SIZE_PX, np.float32)
-        shown = inside_shown(view.valid, points_px.astype(np.float64), sizes)
-        points_px, strengths, sizes = points_px[shown], strengths[shown], sizes[shown]
-        return Raw(
-            source_px=points_px.astype(np.float64),
-            source_sizes_px=sizes,
-            points_px=points_px,
-            sizes_px=sizes,
-            orientations_deg=np.zeros(len(points_px), np.float32),
-            responses=strengths,
-            octaves=np.zeros(len(points_px), np.int32),
-            view_idx=np.full(len(points_px), view_idx, np.int32),
+        # The network looks at pictures of one scale: all keypoints are as large as the finest of `learned`.
+        found = Raw.of_points(
+            points.numpy().astype(np.float64), np.full(len(points), SIZE_PX), scores.numpy(), view_idx
         )
+        return found.take(inside_shown(view.valid, found.source_px, found.sizes_px))
 
     def suffice(self, raw: Raw, factor: int) -> bool:
         """Always, as of `learned`: the surest keypoints of finer views match none of the other images."""

@@ -32,6 +32,21 @@ class Raw:
     octaves: IntArray
     view_idx: IntArray
 
+    @classmethod
+    def of_points(cls, points_px: FloatArray, sizes_px: FloatArray, responses: FloatArray, view_idx: int) -> Raw:
+        """Points (N, 2) of one view with sizes and responses (N,), not turned, of no octave."""
+        count, sizes = len(points_px), sizes_px.astype(np.float32)
+        return cls(
+            source_px=points_px,
+            source_sizes_px=sizes,
+            points_px=points_px.astype(np.float32),
+            sizes_px=sizes,
+            orientations_deg=np.zeros(count, np.float32),
+            responses=responses.astype(np.float32),
+            octaves=np.zeros(count, np.int32),
+            view_idx=np.full(count, view_idx, np.int32),
+        )
+
     def take(self, which: IntArray | BoolArray) -> Raw:
         return Raw(**{key: value[which] for key, value in vars(self).items()})
 

@@ -160,16 +160,7 @@ class Learned(Described):
             return raw if self.orientation == "gradient" else raw.upright()
         most = _CHOICE * self.keypoints
         points, sizes, confidences = heat_keypoints(view.gray, most, view.valid, self._network("detector"))
-        return Raw(
-            source_px=points,
-            source_sizes_px=sizes.astype(np.float32),
-            points_px=points.astype(np.float32),
-            sizes_px=sizes.astype(np.float32),
-            orientations_deg=np.zeros(len(points), np.float32),
-            responses=confidences.astype(np.float32),
-            octaves=np.zeros(len(points), np.int32),
-            view_idx=np.full(len(points), view_idx, np.int32),
-        )
+        return Raw.of_points(points, sizes, confidences, view_idx)
 
     def suffice(self, raw: Raw, factor: int) -> bool:
         """The network's always: the surest of finer views are finer ones, which match none of the other images."""

