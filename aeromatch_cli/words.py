@@ -1,8 +1,29 @@
-"""Words that follow a count."""
+"""Words of messages that follow a count or a list of names."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sized
+
+# Names that a message gives of many.
+_NAMED = 5
 
 
 def form(count: int, one: str, several: str = "") -> str:
     """The form of a noun or verb after a count; by default the plural of a noun has an s more."""
     return one if count == 1 else several or f"{one}s"
+
+
+def listed(names: Iterable[object], shown: int = _NAMED) -> str:
+    """The first names and how many more there are: `a, b and 3 more`."""
+    words = [str(name) for name in names]
+    return ", ".join(words[:shown]) + (f" and {len(words) - shown:,} more" if len(words) > shown else "")
+
+
+def of_images(names: Iterable[object], total: Sized, one: str = "", several: str = "") -> str:
+    """How many of all images these are, and the first of their names: `2 of 9 images (a, b)`.
+
+    one, several: the verb that follows, in its two forms.
+    """
+    some = list(names)
+    verb = f" {form(len(some), one, several)}" if one else ""
+    return f"{len(some)} of {len(total)} images ({listed(some)}){verb}"

@@ -51,7 +51,7 @@ def test_digital_zoom_makes_the_focal_length_longer() -> None:
         "35-mm equivalent of a zoomed picture",
     )
     found = cameras_from_exif({"a.jpg": known}, {})
-    assert [words for words in found.warnings if "digital zoom (a.jpg: 2 x)" in words] == list(found.warnings)
+    assert [words for words in found.warnings if "(a.jpg: 2 x) was taken with digital zoom" in words] == list(found.warnings)
 
 
 def test_two_focal_lengths_of_which_one_must_be_wrong_are_named() -> None:

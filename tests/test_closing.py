@@ -127,7 +127,7 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
             {"spread": {"a": [7, 2, 99]}},
             [
                 "good",
-                "1 of 4 images has no point in a ninth of the picture or more whose ground other images show (a.jpg)",
+                "1 of 4 images (a.jpg) has no point in a ninth of the picture or more whose ground other images show",
             ],
         ),
     ],

@@ -27,10 +27,10 @@ def test_files_that_are_there_twice_are_found_by_their_contents(tmp_path: Path) 
     names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg", "sub/b (1).jpg", "absent.jpg"]
     found = doubles({name: tmp_path / name for name in names})
     assert found == {"d.jpg": "a.jpg", "sub/b (1).jpg": "b.jpg"}
-    assert remarks_on(found, 5) == [
-        "2 of 5 images are there twice (d.jpg is a.jpg, sub/b (1).jpg is b.jpg): remove one of each"
+    assert remarks_on(found, range(5)) == [
+        "2 of 5 images (d.jpg is a.jpg, sub/b (1).jpg is b.jpg) are there twice: remove one of each"
     ]
-    assert remarks_on({}, 5) == []
+    assert remarks_on({}, range(5)) == []
 
 
 def flight(takeoff_m: float = 400.0, relative: bool = True) -> dict[str, ExifFacts]:

@@ -64,7 +64,7 @@ def test_the_same_picture_twice(site):
     assert outcome.facts["stages"]["filter"]["result"]["components"] == [IMAGES + 1]
     first = next(name for name in site.names() if name != "copy.jpg")
     later, earlier = sorted(("copy.jpg", first), reverse=True)
-    assert f"1 of {IMAGES + 1} images is there twice ({later} is {earlier})" in outcome.stderr
+    assert f"1 of {IMAGES + 1} images ({later} is {earlier}) is there twice" in outcome.stderr
 
 
 def test_sizes_depths_and_formats_mixed(site):

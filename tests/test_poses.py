@@ -76,7 +76,7 @@ def test_a_fault_of_every_line_is_one_warning(tmp_path: Path) -> None:
     poses = read_poses(write(tmp_path, "\n".join(["image,lat,lon,alt,yaw,pitch,roll", *lines])))
     assert poses.warnings == (
         "poses.csv, lines 2, 3, 4, 5, 6 and 1,995 more: attitude is incomplete, position only: "
-        "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, ...",
+        "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 1,995 more",
     )
 
 

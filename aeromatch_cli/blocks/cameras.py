@@ -16,7 +16,7 @@ from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.scan import identifier
 from aeromatch_cli.data import Camera
 from aeromatch_cli.geometry.cameras import focal_px, resized
-from aeromatch_cli.words import form
+from aeromatch_cli.words import listed, of_images
 
 FULL_FRAME_DIAGONAL_MM = 43.267
 # Between a wide and a normal lens: what to start from where nothing is known (COLMAP's default_focal_length_factor).
@@ -205,9 +205,8 @@ def _with_lost_numbers(
     if not unclear:
         return found, ()
     return found, (
-        f"{len(unclear)} of {len(facts)} images ({listed(unclear)}) {form(len(unclear), 'has', 'have')} no serial "
-        "number, and others of the same model have several: they count as a camera of their own; better keep cameras "
-        "apart by folders (--cameras folder)",
+        f"{of_images(unclear, facts, 'has', 'have')} no serial number, and others of the same model have "
+        "several: they count as a camera of their own; better keep cameras apart by folders (--cameras folder)",
     )
 
 
@@ -230,7 +229,7 @@ def _with_one_focal_length(
         usual_mm = lengths.most_common(1)[0][0]
         found |= {name: replace(facts[name], focal_mm=usual_mm) for name in names}
         said.append(
-            f"the focal lengths of {len(names)} of {len(facts)} images ({listed(names)}) differ by rounding "
+            f"the focal lengths of {of_images(names, facts)} differ by rounding "
             f"({least:g} to {most:g} mm): they count as one camera with {usual_mm:g} mm"
         )
     return found, tuple(said)
@@ -267,9 +266,8 @@ def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
         )
     if zoomed:
         said.append(
-            f"{len(zoomed)} of {len(facts)} images {form(len(zoomed), 'was', 'were')} taken with digital zoom "
-            f"({listed(zoomed)}): the focal length is multiplied with it, a calibration in XMP does not count, and a "
-            "35-mm equivalent is taken as zoomed"
+            f"{of_images(zoomed, facts, 'was', 'were')} taken with digital zoom: the focal length is "
+            "multiplied with it, a calibration in XMP does not count, and a 35-mm equivalent is taken as zoomed"
         )
     return tuple(said)
 
@@ -285,7 +283,7 @@ def _fisheyes(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
         return ()
     degrees = 2.0 * math.degrees(math.atan(0.5 / _FISHEYE_FOCAL))
     return (
-        f"the field of view of {len(wide)} of {len(facts)} images ({listed(wide)}) is wider than {degrees:.0f} degrees "
+        f"the field of view of {of_images(wide, facts)} is wider than {degrees:.0f} degrees "
         "by EXIF: probably a fisheye lens, of which EXIF does not tell enough; give its camera as OPENCV_FISHEYE, by "
         "--cameras or a pose file that has it, or undistorted images with theirs",
     )
@@ -399,12 +397,6 @@ def _mismatch(name: str, camera: Camera, width_px: int, height_px: int) -> str:
     if fitted(camera, height_px, width_px) is not None:
         return f"{words}: the picture was turned by 90 degrees after capture; use the unturned file or another camera"
     return f"{words}, not the same shape: the picture was cropped, or this is the wrong camera"
-
-
-def listed(names: Mapping[str, object] | list[str], limit: int = 5) -> str:
-    """The first few names for a message."""
-    shown = [str(name) for name in list(names)[:limit]]
-    return ", ".join(shown) + (", ..." if len(names) > limit else "")
 
 
 def sensor_size_mm(make: str, model: str) -> tuple[float, float] | None:

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.control_files import Mark, Survey, SurveyedPoint, read_survey
 from aeromatch_cli.blocks.crs import (
     AUTO,
@@ -33,7 +32,7 @@ from aeromatch_cli.blocks.pose_files.geodesy import unit_remarks
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.words import form
+from aeromatch_cli.words import form, listed
 
 ControlUse = Literal["adjust", "check"]
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import filecmp
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
 from pathlib import Path, PurePosixPath
 
-from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.other_files import twins
-from aeromatch_cli.words import form
+from aeromatch_cli.words import form, listed, of_images
 
 # Files of equal size differ in their first or last bytes, or nowhere: these many are compared before whole ones.
 _EDGE_BYTES = 65_536
@@ -44,13 +43,12 @@ def doubles(files: Mapping[str, Path]) -> dict[str, str]:
     return found
 
 
-def remarks_on(found: Mapping[str, str], total: int) -> list[str]:
+def remarks_on(found: Mapping[str, str], of_all: Sized) -> list[str]:
     """One sentence about all of them."""
     if not found:
         return []
     pairs = [f"{name} is {first}" for name, first in found.items()]
-    verb = form(len(found), "is", "are")
-    return [f"{len(found)} of {total} images {verb} there twice ({listed(pairs)}): remove one of each"]
+    return [f"{of_images(pairs, of_all, 'is', 'are')} there twice: remove one of each"]
 
 
 def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
@@ -78,11 +76,8 @@ def thumbnails(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
                 small.append(f"{name} ({own[0]} x {own[1]})")
     if not small:
         return []
-    what = form(len(small), "is a small copy", "are small copies")
-    return [
-        f"{len(small)} of {len(sizes_px)} images ({listed(small)}) {what} of others, such as thumbnails: "
-        "--exclude leaves them out"
-    ]
+    what = of_images(small, sizes_px, "is a small copy", "are small copies")
+    return [f"{what} of others, such as thumbnails: --exclude leaves them out"]
 
 
 def _edges(path: Path, size: int) -> bytes:

@@ -11,16 +11,15 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.xmp import from_level
 from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.words import form
+from aeromatch_cli.words import of_images
 
 _METRES_PER_DEGREE = 111_320.0
 # One of two statements is the coarser where it has at most this share of the other's different numbers.
@@ -90,7 +89,7 @@ def with_conventions(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFact
             continue
         found |= {name: replace(facts[name], angles=replace(one, convention="gimbal")) for name, one in angles.items()}
         remarks.append(
-            f"{_some(names, names)} {form(len(names), 'has', 'have')} a pitch of {np.median(pitches):.0f} degrees, "
+            f"{of_images(names, names, 'has', 'have')} a pitch of {np.median(pitches):.0f} degrees, "
             "which by its tag (Pix4D's Camera:Pitch) looks backwards: it is taken as counted from level, where -90 "
             "looks down; --set block.angles=nadir reads it by its tag"
         )
@@ -113,7 +112,7 @@ def _sounder(what: str, names: list[str], exif_m: FloatArray, xmp_m: FloatArray)
     stray_names, rest = _those(names, strays), far & ~strays
     remarks = []
     if stray_names:
-        of_strays = _some(stray_names, names)
+        of_strays = of_images(stray_names, names)
         remarks.append(f"EXIF states {what} of {of_strays} far from all others, XMP does not: XMP is used")
     if rest.any():
         remarks.append(f"{_contradiction(what, names, apart_m, rest)}: EXIF is used")
@@ -122,7 +121,7 @@ def _sounder(what: str, names: list[str], exif_m: FloatArray, xmp_m: FloatArray)
 
 def _contradiction(what: str, names: list[str], apart_m: FloatArray, far: BoolArray) -> str:
     """Return what is said of the images (N,) that are `far`. apart_m: (N,) between both statements."""
-    of_those = _some(_those(names, far), names)
+    of_those = of_images(_those(names, far), names)
     return f"EXIF and XMP state different {what} of {of_those}, by {np.median(apart_m[far]):,.1f} m"
 
 
@@ -157,7 +156,7 @@ def _in_feet(facts: Mapping[str, ExifFacts]) -> tuple[Facts, list[str]]:
     feet = [name for name, (exif_m, xmp_m) in both.items() if abs(xmp_m) > _LEAST_FEET_M and _is_feet(exif_m, xmp_m)]
     if len(feet) < len(both) or not both:  # a single one is chance
         return {}, []
-    words = f"GPSAltitude of {_some(feet, facts)} counts in feet, as XMP states the same in metres: XMP is used"
+    words = f"GPSAltitude of {of_images(feet, facts)} counts in feet, as XMP states the same in metres: XMP is used"
     return {name: replace(facts[name], altitude_m=both[name][1]) for name in feet}, [words]
 
 
@@ -175,7 +174,7 @@ def _of_one_sign(facts: Mapping[str, ExifFacts]) -> tuple[Facts, list[str]]:
         return {}, []
     wrong = below if 2 * len(below) <= len(stated) else [name for name in stated if name not in set(below)]
     words = (
-        f"GPSAltitudeRef of {_some(wrong, facts)} says {'below' if wrong is below else 'above'} sea level, and the "
+        f"GPSAltitudeRef of {of_images(wrong, facts)} says {'below' if wrong is below else 'above'} sea level, and the "
         f"other altitudes are as large ({sizes.min():.0f} to {sizes.max():.0f} m): they get the sign of the others"
     )
     return {name: replace(facts[name], altitude_m=-stated[name]) for name in wrong}, [words]
@@ -204,8 +203,8 @@ def _above_take_off(facts: Mapping[str, ExifFacts]) -> tuple[Facts, list[str]]:
     if not changed:
         return {}, []
     words = (
-        f"GPSAltitude of {_some(list(changed), facts)} counts from the take-off point (it is RelativeAltitude), which "
-        f"lies at {usual_m:.0f} m by the other altitudes: it is raised by that"
+        f"GPSAltitude of {of_images(list(changed), facts)} counts from the take-off point (it is RelativeAltitude), "
+        f"which lies at {usual_m:.0f} m by the other altitudes: it is raised by that"
     )
     return changed, [words]
 
@@ -250,9 +249,9 @@ def _two_levels(facts: Mapping[str, ExifFacts]) -> list[str]:
     step_m = float(np.median(upper) - np.median(lower))
     return [
         f"the altitudes lie on two levels, {step_m:.0f} m apart: {lower[0]:.0f} to {lower[-1]:.0f} m in "
-        f"{_some(sorted(names[:first]), facts)}, {upper[0]:.0f} to {upper[-1]:.0f} m in the others. If all were flown "
-        "at one height, one level counts from the take-off point and the other from sea level, and the block comes out "
-        "tilted: give altitudes of one kind with --poses"
+        f"{of_images(sorted(names[:first]), facts)}, {upper[0]:.0f} to {upper[-1]:.0f} m in the others. If all were "
+        "flown at one height, one level counts from the take-off point and the other from sea level, and the block "
+        "comes out tilted: give altitudes of one kind with --poses"
     ]
 
 
@@ -268,8 +267,3 @@ def _with_both(facts: Mapping[str, ExifFacts]) -> dict[str, tuple[float, float]]
         for name, fact in facts.items()
         if fact.altitude_m is not None and fact.xmp_position[2] is not None
     }
-
-
-def _some(names: list[str], of_all: Sized) -> str:
-    """Return how many of the images these are, and the first of their names."""
-    return f"{len(names)} of {len(of_all)} images ({listed(names)})"

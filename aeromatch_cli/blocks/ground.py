@@ -18,6 +18,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import check_given
 from aeromatch_cli.geometry.footprints import MAX_DISTANCE_FACTOR
+from aeromatch_cli.words import listed
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
@@ -32,7 +33,6 @@ _LOWEST_M, _HIGHEST_M, _ABOVE_ZERO_M = -500.0, 9000.0, 100.0
 _SAID_ABOVE_ZERO_M = 5.0
 # Of these also where one unit is so small that they could be heights.
 _CODES = (-9999.0, -32767.0, -32768.0)
-_CODES_NAMED = 3
 # A number and a word behind it.
 _HEIGHT = re.compile(r"[-+]?(?:\d[\d.,]*)?\d\s*(?:[^\W\d]+[\s-]?){0,3}")
 # The geoid is asked for at no more places a side.
@@ -166,12 +166,10 @@ def open_dem(
         said = getattr(error, "strerror", None) or error
         raise ConfigError(f"cannot read the DEM {path}: {said}; give a GeoTIFF of heights or a constant") from error
     if codes:
-        listed = ", ".join(f"{code:g}" for code in codes[:_CODES_NAMED]) + (
-            ", ..." if len(codes) > _CODES_NAMED else ""
-        )
+        named = listed(f"{code:g}" for code in codes)
         notes = (
             *notes,
-            f"the DEM {path} has cells of {listed} that it does not declare as no data: they count as such",
+            f"the DEM {path} has cells of {named} that it does not declare as no data: they count as such",
         )
     known = np.isfinite(heights)
     median = float(np.median(heights[known]))

@@ -18,12 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.fields import IMAGE
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.words import form
+from aeromatch_cli.words import form, listed, of_images
 
 # Running numbers are looked for in so many groups of digits of a name, from the end.
 _DIGIT_GROUPS = 3
@@ -61,8 +60,7 @@ def matched_rows(
         remarks.append(f"{source} names {len(absent)} {what} not in the folder: {listed(absent)}")
     unnamed = [name for name in names if name not in rows]
     if unnamed:
-        verb = form(len(unnamed), "is", "are")
-        remarks.append(f"{len(unnamed)} of {len(names)} images {verb} not in {source}: {listed(unnamed)}")
+        remarks.append(f"{of_images(unnamed, names, 'is', 'are')} not in {source}")
     return rows, remarks
 
 

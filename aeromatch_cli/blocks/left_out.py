@@ -7,18 +7,17 @@ are taken, and some before take-off or after landing.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.other_files import image_suffixes
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
-from aeromatch_cli.words import form
+from aeromatch_cli.words import listed, of_images
 
 # Of one image, of several.
 _PANEL = "shows a reflectance panel by its XMP", "show a reflectance panel by their XMP"
@@ -53,10 +52,7 @@ def excluded(text: str, names: Sequence[str]) -> tuple[frozenset[str], list[str]
             idle += [] if hits else [pattern]
     remarks = []
     if found:
-        verb = form(len(found), "is", "are")
-        remarks.append(
-            f"{len(found)} of {len(names)} images ({listed(sorted(found))}) {verb} left out, as --exclude asks"
-        )
+        remarks.append(f"{of_images(sorted(found), names, 'is', 'are')} left out, as --exclude asks")
     if idle:
         remarks.append(f"--exclude fits no image of the folder: {listed(idle)}")
     return frozenset(found), remarks
@@ -88,13 +84,13 @@ def ground_shots(facts: Mapping[str, ExifFacts]) -> dict[str, tuple[str, str]]:
     return found | dict.fromkeys(_standing(rest), _ON_GROUND)
 
 
-def remarks_on_ground_shots(shots: Mapping[str, tuple[str, str]], total: int, *, dropped: bool) -> list[str]:
+def remarks_on_ground_shots(shots: Mapping[str, tuple[str, str]], of_all: Sized, *, dropped: bool) -> list[str]:
     """Return one sentence for every reason that `ground_shots` has."""
     remedy = "left out" if dropped else "leave them out with --set block.ground_shots=drop"
     remarks = []
     for reason in dict.fromkeys(shots.values()):
         names = [name for name, one in shots.items() if one == reason]
-        remarks.append(f"{len(names)} of {total} images ({listed(names)}) {form(len(names), *reason)}: {remedy}")
+        remarks.append(f"{of_images(names, of_all, *reason)}: {remedy}")
     return remarks
 
 

@@ -18,11 +18,12 @@ from aeromatch_cli.geometry.footprints import (
 )
 from aeromatch_cli.geometry.places import place_labels
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, from_yaw_pitch_roll, rotation_z
+from aeromatch_cli.words import form, listed
 
 # Image names (N,) as an array, so that masks select them.
 Names = NDArray[np.object_]
 
-_NAMES_SHOWN = _PLACES_SHOWN = 3
+_PLACES_SHOWN = 3
 _LOWEST_HEIGHT_M, _HIGHEST_HEIGHT_M = 5.0, 10_000.0
 _NULL_ISLAND_DEG = 0.01
 # Dry land lies hardly below sea level: a ground this low below images that fly above 0 most likely means altitudes
@@ -194,6 +195,4 @@ def _all_zero(rotations: Sequence[FloatArray]) -> bool:
 
 def _some(names: Sequence[str] | Names) -> str:
     """How many images, and the first of them by name."""
-    shown = ", ".join(names[:_NAMES_SHOWN])
-    more = ", ..." if len(names) > _NAMES_SHOWN else ""
-    return f"{len(names)} image{'s' if len(names) != 1 else ''} ({shown}{more})"
+    return f"{len(names)} {form(len(names), 'image')} ({listed(names)})"

@@ -65,6 +65,7 @@ from aeromatch_cli.blocks.units import degrees_of, metres_of, refuse_rounded
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
+from aeromatch_cli.words import form, listed
 
 # What orientation.csv says of images whose place is arbitrary.
 _OWN_FRAME = "own"
@@ -77,7 +78,6 @@ _RANGES = {"lat": 180.0, "lon": 180.0, "qw": 1.05, "qx": 1.05, "qy": 1.05, "qz":
 _LARGEST_ANGLE_DEG = 360.0
 # What a spreadsheet writes to say what separates.
 _SEPARATOR_LINE = re.compile(r"\"?sep=.\"?", re.IGNORECASE)
-_LINES_NAMED = 5  # of those with the same fault
 # Images by line, by what is wrong with it.
 _Faults = dict[str, dict[int, str]]
 
@@ -219,11 +219,7 @@ def _with_latitudes(path: Path, rows: list[PoseRow]) -> tuple[list[PoseRow], lis
 
 def _fault(path: Path, fault: str, images: Mapping[int, str]) -> str:
     """One warning about all lines that have the same fault. images: by line."""
-    lines, names = [str(line) for line in images][:_LINES_NAMED], list(images.values())[:_LINES_NAMED]
-    more = len(images) - len(lines)
-    also = f" and {more:,} more" if more else ""
-    plural = "s" if len(images) > 1 else ""
-    return f"{path.name}, line{plural} {', '.join(lines)}{also}: {fault}: {', '.join(names)}{', ...' if more else ''}"
+    return f"{path.name}, {form(len(images), 'line')} {listed(images)}: {fault}: {listed(images.values())}"
 
 
 def _text(path: Path) -> str:

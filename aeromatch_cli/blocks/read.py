@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, get_args
@@ -22,7 +22,6 @@ from aeromatch_cli.blocks.cameras import (
     cameras_from_exif,
     cameras_from_file,
     contradicting_exif,
-    listed,
 )
 from aeromatch_cli.blocks.crs import (
     AUTO,
@@ -55,7 +54,7 @@ from aeromatch_cli.blocks.sorties import captures_of, flights, velocities
 from aeromatch_cli.data import Camera, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.words import form
+from aeromatch_cli.words import listed, of_images
 
 EXIF = "exif"
 FOLDER = "folder"
@@ -257,7 +256,7 @@ def _chosen_images(
     warnings += said
     facts = {name: fact for name, fact in facts.items() if not fact.panorama}
     shots = ground_shots(facts)
-    warnings += remarks_on_ground_shots(shots, len(facts), dropped=drop_ground_shots)
+    warnings += remarks_on_ground_shots(shots, facts, dropped=drop_ground_shots)
     if drop_ground_shots:
         facts = {name: fact for name, fact in facts.items() if name not in shots}
     return _ChosenImages(facts, unread + panoramas, failures, warnings)
@@ -310,7 +309,7 @@ def _located(
     stated = _stated_heights(lists, wanted, given_heights)
     located, heights, remarks = in_world_heights(located, stated, wanted, crs, given_heights.shift_m)
     warnings += remarks
-    warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
+    warnings += [f"{of_images(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
     warnings += _level_flight(located, facts)
     warnings += foreign_crs(located)
     return located, heights, warnings
@@ -420,7 +419,8 @@ def _cameras_of_poses(
     found = cameras_from_file(stated, named, columns)
     others = cameras_from_exif({name: fact for name, fact in facts.items() if name not in found.camera_ids}, {})
     unfit = [
-        f"{_verb(found.reasons, facts, 'does', 'do')} not take the camera of the pose file but that of EXIF: {reason}"
+        f"{of_images(found.reasons, facts, 'does', 'do')} not take the camera of the pose file but that of EXIF: "
+        f"{reason}"
         for reason in list(found.reasons.values())[:1]
     ]
     return CameraAssignment(
@@ -446,7 +446,7 @@ def _rasters(facts: Mapping[str, ExifFacts]) -> list[str]:
     """A warning of files that are probably results of an earlier project: a folder above the images was given."""
     names = [name for name, fact in facts.items() if fact.georeferenced]
     what = "georeferenced (GeoTIFF), as orthophotos and height models are"
-    said = f"{_verb(names, facts, 'is', 'are')} {what}: move out of the folder what is no aerial image"
+    said = f"{of_images(names, facts, 'is', 'are')} {what}: move out of the folder what is no aerial image"
     return [said] if names else []
 
 
@@ -470,7 +470,7 @@ def _observations(
                 without["no angles in XMP: position only"].append(name)
         else:
             without["no GPS position: treated as unposed"].append(name)
-    remarks = [f"{_verb(items, facts, 'has', 'have')} {what}" for what, items in without.items()]
+    remarks = [f"{of_images(items, facts, 'has', 'have')} {what}" for what, items in without.items()]
     notes = Counter(note for fact in facts.values() for note in fact.notes)
     for note, count in notes.items():
         remarks.append(f"{count} of {len(facts)} images: {note}")
@@ -520,7 +520,7 @@ def _with_exif_heights(
     heights_m = {name: height_m for name in observations if (height_m := facts[name].altitude_m) is not None}
     for name, height_m in heights_m.items():
         observations[name] = replace(observations[name], position=(*observations[name].position[:2], height_m))
-    remark = f"{_verb(heights_m, observations, 'has', 'have')} no height in the list: that of EXIF is used"
+    remark = f"{of_images(heights_m, observations, 'has', 'have')} no height in the list: that of EXIF is used"
     return observations, [remark] if heights_m else []
 
 
@@ -544,17 +544,9 @@ def _level_flight(located: Located, facts: Mapping[str, ExifFacts]) -> list[str]
     if located.heights_from_flight:
         zero = "0 m, so that heights count from the flight"
     return [
-        f"{_verb(located.level, facts, 'has', 'have')} a position without height: a level flight at {zero}, is assumed"
+        f"{of_images(located.level, facts, 'has', 'have')} a position without height: a level flight at {zero}, "
+        "is assumed"
     ]
-
-
-def _count(names: Collection[str], total: Mapping[str, object]) -> str:
-    return f"{len(names)} of {len(total)} images ({listed(list(names))})"
-
-
-def _verb(names: Collection[str], total: Mapping[str, object], one: str, several: str) -> str:
-    """How many of the images these are, and the verb of what is said of them."""
-    return f"{_count(names, total)} {form(len(names), one, several)}"
 
 
 def _stated_ground(camera_file: CameraFile | None, frame: WorldFrame, source: str) -> tuple[float, str] | None:

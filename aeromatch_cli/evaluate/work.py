@@ -21,14 +21,13 @@ from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.store.matches import match_points
 from aeromatch_cli.store.opened import OpenedBlock
-from aeromatch_cli.words import form
+from aeromatch_cli.words import of_images
 from aeromatch_cli.workspace import Workspace
 
 # Pairs that truly share this much count, whether they were tried or not.
 MIN_OVERLAP = 0.20
 # The quick estimate is of a coarse grid: pairs somewhat below are looked at properly.
 _QUICK_OVERLAP = 0.15
-_NAMED = 5
 _NOTHING: FloatArray = np.zeros((0, 2))
 
 
@@ -119,10 +118,9 @@ def _judged(
     unknown = tuple(image.name for image in images if image.name not in truth.cameras)
     # Every image of a rendered block has its truth; an adjustment may have left some out.
     if len(known) < 2 or (unknown and truth.kind == "rendered"):
-        more = f" and {len(unknown) - _NAMED} more" if len(unknown) > _NAMED else ""
         raise InputError(
-            f"{len(unknown)} of the {len(images)} images of the workspace {form(len(unknown), 'is', 'are')} not in the "
-            f"truth {truth_folder} ({', '.join(unknown[:_NAMED])}{more}): give the truth of the same block"
+            f"{of_images(unknown, images, 'is', 'are')} of the workspace, but not in the truth "
+            f"{truth_folder}: give the truth of the same block"
         )
     for image in known:
         camera = truth.cameras[image.name]

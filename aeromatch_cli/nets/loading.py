@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.files import content_stamp, read_tensors
 from aeromatch_cli.nets.precision import Precision, layer_type
+from aeromatch_cli.words import listed
 
-_MAX_NAMED = 3
 Network = TypeVar("Network", bound=nn.Module)
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -72,7 +72,7 @@ def check_same_tensors(
         if expected[key].shape != given[key].shape
     ]
     problems = [
-        f"{what}: {', '.join(keys[:_MAX_NAMED])}" + (f" and {len(keys) - _MAX_NAMED} more" * (len(keys) > _MAX_NAMED))
+        f"{what}: {listed(keys)}"
         for what, keys in (("missing", missing), ("unexpected", unexpected), ("wrong shape", shapes))
         if keys
     ]

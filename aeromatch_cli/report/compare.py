@@ -20,12 +20,11 @@ from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.settings_diff import said_value
 from aeromatch_cli.stages.stage_report import result_on_file
 from aeromatch_cli.store.opened import OpenedBlock
-from aeromatch_cli.words import form
+from aeromatch_cli.words import form, listed
 from aeromatch_cli.workspace import Workspace
 
 # Differences that are not chance, as a share of the larger value.
 _ERROR_SHARE, _MATCHES_SHARE = 0.1, 0.05
-_LISTED = 10
 # Settings that change no result.
 _OUTWARD = ("workspace", "run")
 # Of the images of the larger block: with fewer in common two blocks have nothing to be compared by.
@@ -161,7 +160,7 @@ def _check_images(first: Path, second: Path, one: _Side, two: _Side) -> None:
     common = sorted(one.images.keys() & two.images.keys())
     if len(common) < _LEAST_COMMON * max(len(one.images), len(two.images)):
         told = "; ".join(
-            f"{len(names)} only in {root}: {_listed(names)}"
+            f"{len(names)} only in {root}: {listed(sorted(names))}"
             for root, names in ((first, one.images.keys() - common), (second, two.images.keys() - common))
             if names
         )
@@ -172,8 +171,9 @@ def _check_images(first: Path, second: Path, one: _Side, two: _Side) -> None:
     others = [name for name in common if not _same(one.images[name], two.images[name])]
     if others:
         raise ConfigError(
-            f"{first} and {second} are workspaces of different images: those named {_listed(others)} have another size "
-            "or time of capture in each; compare two workspaces of the same images"
+            f"{first} and {second} are workspaces of different images: those named "
+            f"{listed(sorted(others))} have another size or time of capture in each; compare two workspaces of "
+            "the same images"
         )
 
 
@@ -183,11 +183,6 @@ def _same(image: Image, other: Image) -> bool:
     return sizes and (not image.time or not other.time or image.time == other.time)
 
 
-def _listed(names: Any) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(sorted(names)[:_LISTED]) + more
-
-
 def _image_lines(one: _Side, two: _Side) -> Iterator[str]:
     yield _counts("images", len(one.images), len(two.images))
     for words, names in (
@@ -195,7 +190,7 @@ def _image_lines(one: _Side, two: _Side) -> Iterator[str]:
         ("only in the second", two.images.keys() - one.images.keys()),
     ):
         if names:
-            yield f"            {words}: {_listed(names)}"
+            yield f"            {words}: {listed(sorted(names))}"
 
 
 def _match_lines(one: _Side, two: _Side) -> Iterator[str]:
@@ -204,8 +199,7 @@ def _match_lines(one: _Side, two: _Side) -> Iterator[str]:
     yield _counts("verified", len(verified[0]), len(verified[1]))
     for words, pairs in (("lost", verified[0] - verified[1]), ("gained", verified[1] - verified[0])):
         if pairs:
-            shown = "; ".join(" and ".join(pair) for pair in sorted(pairs)[:_LISTED])
-            yield f"            {len(pairs)} {words}: {shown}"
+            yield f"            {len(pairs)} {words}: {listed('-'.join(pair) for pair in sorted(pairs))}"
     yield _counts("matches", sum(one.matches.values()), sum(two.matches.values()))
     both = sorted(verified[0] & verified[1])
     ratios = [two.matches[pair] / one.matches[pair] for pair in both]

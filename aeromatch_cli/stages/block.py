@@ -226,7 +226,7 @@ def _read_inputs(
         given_heights=GivenHeights(given.heights, given.height_shift_m),
     )
     twice = doubles({image.name: on_disk(remote.get(image.name) or root / image.name) for image in inputs.images})
-    inputs = replace(inputs, warnings=(*inputs.warnings, *remarks_on(twice, len(inputs.images))))
+    inputs = replace(inputs, warnings=(*inputs.warnings, *remarks_on(twice, inputs.images)))
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
     found = {image.image_id: prints[image.name] for image in inputs.images}
     places = {image.image_id: remote.get(image.name) or root / image.name for image in inputs.images}

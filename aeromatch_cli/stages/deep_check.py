@@ -7,14 +7,11 @@ from pathlib import Path
 
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.stages.command_result import Result
-from aeromatch_cli.stages.messages import listed
 from aeromatch_cli.store.damage import find_damage
+from aeromatch_cli.words import listed
 from aeromatch_cli.workspace import Workspace, opened_workspace
 
 log = logging.getLogger("aeromatch")
-
-# Most files without a checksum that are named.
-_NAMED = 5
 
 
 def run(root: Path) -> Result:
@@ -26,7 +23,7 @@ def run(root: Path) -> Result:
     found = find_damage(workspace)
     lines = [f"checked          {found.files:,} files, {found.size_bytes / 1e6:,.1f} MB"]
     if found.without_checksum:
-        lines.append(f"no checksum      {listed(found.without_checksum, _NAMED)}")
+        lines.append(f"no checksum      {listed(found.without_checksum)}")
     for name, reason in found.damaged.items():
         log.warning("damaged: %s: %s", root / name, reason)
     if found.damaged:

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from aeromatch_cli.files import write_text
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.results.stages import BlockResults
+from aeromatch_cli.words import form, listed
 from aeromatch_cli.workspace import Workspace
 
-_NAMED = 5
 # What becomes of an image that is lost; also the column `what` of lost.csv.
 _FAILED, _UNORIENTED, _UNCONNECTED = "not read", "not oriented", "not connected"
 
@@ -39,12 +39,9 @@ def lost_lines(workspace: Workspace, lost: Sequence[Lost], images: int) -> list[
     if not lost:
         return []
     counts = ", ".join(f"{count} {what}" for what, count in sorted(Counter(what for _, what, _ in lost).items()))
-    shown = ", ".join(name for name, _, _ in lost[:_NAMED])
-    more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
-    verb = "is" if len(lost) == 1 else "are"
     return [
-        f"lost      {len(lost)} of {images} images {verb} not in the result ({counts}): {shown}{more}; "
-        f"listed in {workspace.lost}"
+        f"lost      {len(lost)} of {images} images {form(len(lost), 'is', 'are')} not in the result ({counts}): "
+        f"{listed(name for name, _, _ in lost)}; listed in {workspace.lost}"
     ]
 
 

@@ -21,7 +21,7 @@ from aeromatch_cli.sfm.control import offset_words
 from aeromatch_cli.sfm.mapping import Group
 from aeromatch_cli.stages.filter import WEAK_MATCHES
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.words import form
+from aeromatch_cli.words import form, listed
 
 # What a control figure is of, in words.
 _CHECKED = {"check points": "check points", "leave one out": "each control point, fitted without it"}
@@ -99,8 +99,7 @@ def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) 
         lines.append(f"could not be read: {listed([names[i] for i in found.unread])}")
     components = found.components
     if len(components) > 1:
-        shown = ", ".join(str(size) for size in components[:8]) + (", ..." if len(components) > 8 else "")
-        lines.append(f"{len(components)} unconnected groups of images, of sizes {shown}")
+        lines.append(f"{len(components)} unconnected groups of images, of sizes {listed(components)}")
     else:
         lines.append("all images are connected")
     if found.weakly_tied:
@@ -307,8 +306,3 @@ def _adjusted_words(control: ControlInGroup) -> Iterator[str]:
         yield f"{used} control {form(used, 'point takes', 'points take')} part in the adjustment{errors}"
     else:
         yield f"the control points were left out of the adjustment, since they make it no better{errors}"
-
-
-def listed(names: Sequence[str], shown: int = 10) -> str:
-    """Return names in words, the first of many."""
-    return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")

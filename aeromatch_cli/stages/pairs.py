@@ -19,6 +19,7 @@ from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import OrientResult, PairsResult
 from aeromatch_cli.stages import orient, picture_quality
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
+from aeromatch_cli.stages.cascade import strategies_of
 from aeromatch_cli.stages.context import Context, Scope
 from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network
 from aeromatch_cli.stages.messages import orientation_lines
@@ -205,15 +206,19 @@ def _check_settings(settings: Settings) -> None:
 
 
 def chosen_strategies(settings: Settings) -> Iterator[Strategy]:
+    """All that the settings name, and those that their steps take instead."""
     yield from (settings.orient, settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
-    yield from settings.cascade
+    for step in settings.cascade:
+        yield step
+        yield from strategies_of(step, settings).values()
     yield from settings.filter
     yield from settings.export
 
 
 def _remarks(settings: Settings) -> list[str]:
     """Say what the settings bring that their user may not expect."""
-    return [f"own weights      {path}" for strategy in chosen_strategies(settings) for path in strategy.own_weights()]
+    own = dict.fromkeys(path for strategy in chosen_strategies(settings) for path in strategy.own_weights())
+    return [f"own weights      {path}" for path in own]
 
 
 def _fingerprint(context: Context) -> str:

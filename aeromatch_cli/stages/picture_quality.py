@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 
-from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.data import PictureQuality
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.fingerprints import contents_digest
@@ -14,7 +13,7 @@ from aeromatch_cli.formats.tables import read_picture_quality
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.sharpness import read_quality, shows_nothing, unsharp
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.words import form
+from aeromatch_cli.words import of_images
 
 _REMEDY = "look at them; --exclude leaves images out"
 
@@ -62,9 +61,8 @@ def remarks(context: Context, found: Mapping[str, PictureQuality]) -> list[str]:
         kinds["far more blurred than others of the same camera"] += [
             f"{names[ids[k]]} ({found[ids[k]].blur:.2f})" for k in unsharp([found[i].blur for i in ids])
         ]
-    total = len(context.block.images)
     return [
-        f"{len(some)} of {total} images {form(len(some), 'is', 'are')} {what}: {listed(some)}: {_REMEDY}"
+        f"{of_images(some, context.block.images, 'is', 'are')} {what}: {_REMEDY}"
         for what, some in kinds.items()
         if some
     ]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from aeromatch_cli.results.stages import BlockResults
 from aeromatch_cli.sfm.quality.finding import Quality
 from aeromatch_cli.stages.filter import WEAK_MATCHES
+from aeromatch_cli.words import listed, of_images
 
-_NAMED = 5
 # Images with fewer points that three images see hold a block adjustment loosely.
 _FEW_POINTS = 20
 
@@ -35,21 +35,16 @@ def _weak(results: BlockResults, names: Mapping[str, str]) -> list[str]:
     lines = []
     tied = [] if results.connection is None else results.connection.weakly_tied
     if tied:
-        lines.append(f"weak: {_listed(tied, names)}, with fewer than {WEAK_MATCHES} verified matches")
+        lines.append(f"weak: {listed(names.get(i, i) for i in tied)}, with fewer than {WEAK_MATCHES} verified matches")
     spread = {} if results.consistency is None else results.consistency.spread
     loose = [i for i, ninths in spread.items() if ninths.points < _FEW_POINTS and i not in tied]
     if loose and len(spread) > 2:
-        lines.append(f"weak: {_listed(loose, names)}, with fewer than {_FEW_POINTS} points that three images see")
+        named = listed(names.get(i, i) for i in loose)
+        lines.append(f"weak: {named}, with fewer than {_FEW_POINTS} points that three images see")
     empty = [i for i, ninths in spread.items() if ninths.empty]
     if empty:
-        verb = "has" if len(empty) == 1 else "have"
         lines.append(
-            f"{len(empty)} of {len(spread)} images {verb} no point in a ninth of the picture or more whose ground "
-            f"other images show ({_listed(empty, names)}): less evenly tied, which does not change the verdict"
+            f"{of_images((names.get(i, i) for i in empty), spread, 'has', 'have')} no point in a ninth of the picture "
+            "or more whose ground other images show: less evenly tied, which does not change the verdict"
         )
     return lines
-
-
-def _listed(ids: Sequence[str], names: Mapping[str, str]) -> str:
-    shown = ", ".join(names.get(i, i) for i in ids[:_NAMED])
-    return shown + (f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else "")

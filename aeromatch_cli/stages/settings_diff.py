@@ -10,9 +10,7 @@ from typing import Any
 from aeromatch_cli import graph
 from aeromatch_cli.config import Settings, differing, load, plain
 from aeromatch_cli.errors import ConfigError
-
-# Most settings that are named.
-_NAMED = 4
+from aeromatch_cli.words import listed
 
 
 def changed_words(config: Path, settings: Settings) -> str:
@@ -29,10 +27,9 @@ def changed_words(config: Path, settings: Settings) -> str:
     ]
     if not changed:
         return ""
-    named = ", ".join(f"{key} {said_value(old)} -> {said_value(new)}" for key, old, new in changed[:_NAMED])
-    more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+    named = listed(f"{key} {said_value(old)} -> {said_value(new)}" for key, old, new in changed)
     first = min((graph.first_reader(key) for key, *_ in changed), key=graph.ORDER.index)
-    return f"{named}{more}: what depends on it is made again, from {first} on"
+    return f"{named}: what depends on it is made again, from {first} on"
 
 
 def _resolved(value: Any) -> Any:

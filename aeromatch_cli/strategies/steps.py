@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from aeromatch_cli.nets.precision import DEVICE, Device, Precision, check_device
+from aeromatch_cli.nets.precision import DEVICE, Device, Precision
 from aeromatch_cli.strategies import Strategy
 
 _KEYPOINTS: int | None = Field(
@@ -110,16 +110,6 @@ class LearnedFeatures(Step):
     )
     precision: Precision = _PRECISION
     device: Device = DEVICE
-
-    def check_files(self, descriptor_length: int) -> None:
-        """The device is looked for, and published weights. Raises ConfigError where one is missing."""
-        super().check_files(descriptor_length)
-        check_device(self.device)
-        if self.features == "aliked":
-            from aeromatch_cli.nets.published import published_path
-
-            for name in ("aliked-n16rot", *(["aliked_lightglue"] if self.lightglue else [])):
-                published_path(name)
 
 
 STEPS: Mapping[str, type[Step]] = {"guided": GuidedSearch, "learned": LearnedFeatures}

@@ -17,7 +17,7 @@ from aeromatch_cli.sfm.quality.finding import (
     positions_given,
     rms,
 )
-from aeromatch_cli.words import form
+from aeromatch_cli.words import form, listed
 
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
@@ -42,8 +42,7 @@ def connection(evidence: QualityInput) -> Iterator[Finding]:
     if len(sizes) == 1:
         yield Finding("connection", 0.0, 0.0, "good", "all images are connected")
         return
-    shown = ", ".join(map(str, sizes[:5])) + (", ..." if len(sizes) > 5 else "")
-    words = f"{len(sizes)} groups of images ({shown}) that no verified pair connects"
+    words = f"{len(sizes)} groups of images ({listed(sizes)}) that no verified pair connects"
     if 0 < evidence.components_before < len(sizes):
         before = "one" if evidence.components_before == 1 else f"{evidence.components_before}"
         words += f", {before} before the stage consistency dropped matches"
@@ -180,8 +179,7 @@ def _loose_parts(images: Sequence[int]) -> Finding:
 
 
 def _sizes(parts: Sequence[int]) -> str:
-    shown = ", ".join(map(str, parts[:5])) + (", ..." if len(parts) > 5 else "")
-    return f"{len(parts)} parts ({shown} images)"
+    return f"{len(parts)} parts ({listed(parts)} images)"
 
 
 def kept_poses(evidence: QualityInput) -> Found:

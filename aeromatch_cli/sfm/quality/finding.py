@@ -14,6 +14,7 @@ from aeromatch_cli.results.adjustment import (
 )
 from aeromatch_cli.results.record import Record
 from aeromatch_cli.results.stages import AdjustResult, OrientResult
+from aeromatch_cli.words import listed
 
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
@@ -90,8 +91,7 @@ class QualityInput(Record):
 
     def named(self, image_ids: Sequence[str], most: int = 5) -> str:
         """List images by the names of their files, at most so many of them."""
-        shown = ", ".join(self.names.get(i, i) for i in image_ids[:most])
-        return shown + (f" and {len(image_ids) - most} more" if len(image_ids) > most else "")
+        return listed((self.names.get(i, i) for i in image_ids), most)
 
 
 def part_words(group: GroupResult, groups: Sequence[GroupResult], names: Mapping[str, str]) -> str:

@@ -7,20 +7,18 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
-from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, ratio_test_both_ways
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found
 from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
-from aeromatch_cli.strategies.matchers.descriptors.search import Steps, guide_below_field, guided_field
+from aeromatch_cli.strategies.matchers.descriptors.search import Steps
 from aeromatch_cli.strategies.matchers.lightglue.inference import NetworkInput, with_expected_places
-from aeromatch_cli.strategies.matchers.lightglue.matcher import EVERY, Attention, network_below_field, width_field
+from aeromatch_cli.strategies.matchers.lightglue.matcher import EveryPair, width_field
 
-# Learned descriptors are less alike than those of SIFT: as in the preset oblique.
-_RATIO = 0.9
 # With places half a picture off, or turned by 90 degrees, 13 and 93 matches of a pair of ochota agree with one pose;
 # with right places 805. A hard pair has few with right places, too, and more than without the network.
 _FEW = 100
 
 
-class LearnedLightGlue(Attention):
+class LearnedLightGlue(EveryPair):
     """LightGlue, a network that matches by attention between both images, for the features of `extract=learned`.
 
     The weights that ship turn the attention between both images by the places where poses and ground expect the
@@ -30,21 +28,13 @@ class LearnedLightGlue(Attention):
     version: ClassVar[int] = 3
     reads_descriptors: ClassVar[str] = "GeoDesc"
     shipped: ClassVar[str] = "lightglue-learned"
-    signed: ClassVar[bool] = True
     name: Literal["lightglue-learned"] = "lightglue-learned"
-    guided: bool = guided_field(default=True)
-    guide_below_matches: int = guide_below_field(EVERY)
-    network_below_matches: int = network_below_field(EVERY)
     # Twelve real pairs of 2,048 descriptors: 240 correct matches a pair with 0.99, 239 with 0.95 in two fifths of the
     # network's seconds.
     width_confidence: float = width_field(0.95)
     expect_places: bool = Field(
         True, description="Tell the network where poses and ground expect each keypoint, where they are known."
     )
-
-    def scan(self, comparison: Comparison) -> Found:
-        """The ratio test from either image, as `Bidirectional` has it for learned features."""
-        return ratio_test_both_ways(comparison, _RATIO)
 
     def reads(self) -> frozenset[str]:
         """All of the geometry where places are expected."""

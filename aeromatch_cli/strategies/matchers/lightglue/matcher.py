@@ -18,11 +18,17 @@ from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.precision import DEVICE, Device, Precision, check_device, device_of
 from aeromatch_cli.strategies.matchers.descriptors.assignment import one_to_one
-from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined, ratio_test
+from aeromatch_cli.strategies.matchers.descriptors.comparison import (
+    Comparison,
+    Found,
+    joined,
+    ratio_test,
+    ratio_test_both_ways,
+)
 from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
 from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch
 from aeromatch_cli.strategies.matchers.descriptors.overlap import in_overlap
-from aeromatch_cli.strategies.matchers.descriptors.search import Search, Steps
+from aeromatch_cli.strategies.matchers.descriptors.search import Search, Steps, guide_below_field, guided_field
 from aeromatch_cli.strategies.matchers.lightglue.inference import (
     NetworkInput,
     NetworkOptions,
@@ -33,10 +39,11 @@ from aeromatch_cli.strategies.matchers.lightglue.inference import (
 
 # Smallest cost of matches that the network did not find; those of the network have 1 - probability.
 _DOUBTFUL = 0.7
-# More than a pair has: every pair is guided and shown to the network, which finds more in easy ones as well.
-EVERY = 100_000
+# More than a pair has: the network finds more in easy pairs as well.
+_EVERY = 100_000
 # The network's matches above these probabilities are tried as well: on unusual ground it is overconfident.
 _SURER = (0.3, 0.5, 0.8)
+_LEARNED_RATIO = 0.9
 
 
 def network_below_field(default: int) -> Any:
@@ -216,6 +223,20 @@ class Attention(Search):
             path, self.precision, self.device, self.threshold, self.depth_confidence, self.width_confidence
         )
         return loaded_network(wanted).run_network(inputs)
+
+
+class EveryPair(Attention):
+    """LightGlue for learned descriptors, which are less alike than those of SIFT: it is shown every pair, and what it
+    finds is searched once more, guided."""
+
+    signed: ClassVar[bool] = True
+    guided: bool = guided_field(default=True)
+    guide_below_matches: int = guide_below_field(_EVERY)
+    network_below_matches: int = network_below_field(_EVERY)
+
+    def scan(self, comparison: Comparison) -> Found:
+        """The ratio test from either image, as `Bidirectional` has it in the preset oblique."""
+        return ratio_test_both_ways(comparison, _LEARNED_RATIO)
 
 
 class LightGlue(Attention):
