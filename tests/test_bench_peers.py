@@ -15,6 +15,7 @@ import pytest
 from benchmarks import __main__, scenes
 from benchmarks.peers import base, command, ground, matching, published, table
 from benchmarks.peers.base import Options, Scene
+from benchmarks.peers.union import Union
 from conftest import HEIGHT, WIDTH, Site
 
 from aeromatch_cli.errors import ConfigError
@@ -306,3 +307,40 @@ def test_peers_on_rectified_views_answer_in_stored_pixels(site: Site) -> None:
     assert score.median_error_px < 1.0
     with pytest.raises(ConfigError, match="budget"):
         table.method("opencv-sift@ground")(scene, base.Options(150, "view", 1, 0, None))
+
+
+def test_two_peers_together_have_the_matches_of_both(site: Site) -> None:
+    truth = open_truth(site.root)
+    names = tuple(sorted(truth.cameras))[:2]
+    scene = base.Scene("suburb", site.images, site.poses, site.root / "block.json", truth.cameras, (names,))
+    options = base.Options(150, "image", 1, 0, None)
+    both = Union(scene, options, first=table.PEERS["opencv-sift"], second=table.PEERS["opencv-sift@ground"])
+    sides = [both.features(name) for name in names]
+    assert [[len(one.places_px) for one in side] for side in sides] == [[150, 75], [150, 75]]
+    found = both.match(*names, *sides)
+    alone = [peer.match(*names, *own) for peer, *own in zip(both.peers, *sides, strict=True)]
+    assert len(alone[0].points0_px) > 0
+    assert len(alone[1].points0_px) > 0
+    assert (found.points1_px == np.concatenate([one.points1_px for one in alone])).all()
+    assert found.descriptors == 225
+
+
+def test_a_preset_with_further_steps_is_run_on_the_whole_block_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, site: Site
+) -> None:
+    assert table.by_block("auto")
+    assert not table.by_block("oblique")
+    assert not table.by_block("aliked+lightglue:total")
+    judged = scenes.judged_block("suburb", site.root, scenes.Selection("angles", 2, 0))
+    figures = {"possible": None, "kept": 8.0, "correct": 7.0, "median_error_px": 0.2}
+    runs: list[str] = []
+
+    def run(spec: str, *_: Any, **__: Any) -> tuple[dict[tuple[str, str], Row], float]:
+        runs.append(spec)
+        return {pair.images: figures for pair in judged.pairs} | {("x", "y"): figures}, 30.0
+
+    monkeypatch.setattr(command, "judged_run", run)
+    for _ in range(2):
+        rows = list(command._of_run("auto", judged, base.Options(150, "image", 1, 0, None), tmp_path))
+        assert rows == [{**figures, "seconds": 30.0 / (len(judged.pairs) + 1)}] * len(judged.pairs)
+    assert runs == ["auto"]

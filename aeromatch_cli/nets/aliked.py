@@ -86,6 +86,7 @@ class AlikedNetwork:
             for block in (3, 4)
             for n in (1, 2)
         }
+        self.head = [_of_eight(tensors[f"score_head.{n}.weight"]) for n in (2, 4, 6)]
         self.positions = len(tensors["desc_head.agg_weights"])
 
     @torch.inference_mode()
@@ -139,9 +140,9 @@ class AlikedNetwork:
             for part in coarse:
                 found += _enlarged(part, size, rows, columns)
             found = F.selu_(found)
-            for n in (2, 4):
-                found = F.selu_(F.conv2d(found, self.tensors[f"score_head.{n}.weight"], padding=1))
-            return F.conv2d(found, self.tensors["score_head.6.weight"], padding=1).sigmoid_()
+            for weight in self.head[:-1]:
+                found = F.selu_(F.conv2d(found, weight, padding=1))
+            return F.conv2d(found, self.head[-1], padding=1)[:, :1].sigmoid()
 
         return _in_placed_pieces(full, _SCORE_REACH_PX, scored)
 
@@ -226,6 +227,11 @@ def _folded(tensors: Mapping[str, Tensor], layer: str, norm: str) -> tuple[Tenso
     return tensors[f"{layer}.weight"] * scale[:, None, None, None], tensors[f"{norm}.bias"] - scale * tensors[
         f"{norm}.running_mean"
     ]
+
+
+def _of_eight(weight: Tensor) -> Tensor:
+    """A layer of 3 x 3 with zeros for channels that it lacks: vector units take eight at a time."""
+    return F.pad(weight, (0, 0, 0, 0, 0, -weight.shape[1] % 8, 0, -len(weight) % 8))
 
 
 def _square(first: int, stop: int) -> Tensor:

@@ -14,7 +14,7 @@ PEER_CODE = (
     *(
         f"benchmarks/peers/{name}.py"
         for name in (
-            "aliked", "base", "colmap", "kornia_peers", "matching", "opencv", "published", "superpoint",
+            "aliked", "base", "colmap", "kornia_peers", "matching", "opencv", "published", "superpoint", "union",
         )
     ),
 )  # fmt: skip

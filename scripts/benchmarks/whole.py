@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.config import Settings
+from aeromatch_cli.config import Settings, load, parse_method
 from aeromatch_cli.errors import ConfigError
+from benchmarks.tables import Row, plain
+
+# Of every judged pair, in what `evaluate` says of it.
+_FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,37 @@ def budget_settings(settings: Settings, keypoints: int) -> list[str]:
     most = keypoints if settings.extract.name == "sift" else keypoints // 2
     asked = [f"extract.keypoints={most}"] if hasattr(settings.extract, "keypoints") else []
     return asked + [f"cascade.{s.name}.keypoints={keypoints // 2}" for s in settings.cascade if s.own_features]
+
+
+def judged_run(
+    method: str,
+    images: Path,
+    poses: Path,
+    cameras: Path,
+    work: Path,
+    keypoints: int,
+    *,
+    jobs: int,
+    start: Path | None = None,
+) -> tuple[Mapping[tuple[str, str], Row], float]:
+    """Figures of every pair that a preset, with settings in brackets, verifies or that overlaps, by its two images, and
+    the run's seconds. images: of a block with its truth beside them. start: a workspace to go on from a copy of.
+
+    SystemExit where the run fails.
+    """
+    preset, own = parse_method(method)
+    given = ["--poses", str(poses), "--cameras", str(cameras), "--crs", "local"]
+    settings = [*budget_settings(load(preset, own), keypoints), *own, "run.report=false"]
+    run = whole_run("run", preset, images, work, extra=given, jobs=jobs, settings=settings, start=start)
+    if not run.answer:
+        raise SystemExit(f"aeromatch run {method} on {images.parent} failed with exit code {run.code}:\n{run.said}")
+    evaluated(work, images.parent, mapping=False)
+    with (work / "evaluation" / "pairs.csv").open(encoding="utf-8", newline="") as stream:
+        rows = {
+            (row["image0"], row["image1"]): {key: plain(float(row[key] or "nan")) for key in _FIGURES}
+            for row in csv.DictReader(stream)
+        }
+    return rows, run.seconds
 
 
 def evaluated(work: Path, truth: Path, *, mapping: bool) -> dict[str, Any]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import re
 import shutil
 from contextlib import nullcontext
 from pathlib import Path
 from threading import RLock
 
-from aeromatch_cli.config import load, parse_method
+from aeromatch_cli.config import parse_method
 from aeromatch_cli.files import read_json, write_json
 from benchmarks.auto.blocks import Block
 from benchmarks.peers.base import Options
@@ -19,7 +18,7 @@ from benchmarks.peers.worker import measure
 from benchmarks.scenes import NOISY_POSES, Judged, with_noisy_poses
 from benchmarks.sources import OUR_CODE, code_digest
 from benchmarks.tables import Row, plain
-from benchmarks.whole import budget_settings, evaluated, whole_run
+from benchmarks.whole import judged_run
 
 JUDGED = "auto"
 # Of auto as it is: several settings of it, which run at a time, start from its one workspace.
@@ -53,24 +52,16 @@ def _preset_rows(args: argparse.Namespace, block: Block, judged: Judged, method:
     """By `aeromatch run` with the block's cameras and noisy poses. auto's workspace stays; auto with other settings
     goes on from a copy of it, so that only what these change is made again."""
     preset, own = parse_method(method)
-    scene, work = judged.scene, folder / "work"
-    given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
-    settings = [*budget_settings(load(preset, own), args.keypoints), *own, "run.report=false"]
-    start = None
+    scene, work, start = judged.scene, folder / "work", None
     if preset == JUDGED and own:
         rows_of(args, block, judged, JUDGED)
         start = folder.with_name(JUDGED) / "work"
-    run = whole_run("run", preset, scene.images, work, extra=given, jobs=1, settings=settings, start=start)
-    if not run.answer:
-        raise SystemExit(f"aeromatch run {method} on {block.name} failed with exit code {run.code}:\n{run.said}")
-    evaluated(work, scene.images.parent, mapping=False)
-    with (work / "evaluation" / "pairs.csv").open(encoding="utf-8", newline="") as stream:
-        by_pair = {(row["image0"], row["image1"]): row for row in csv.DictReader(stream)}
+    poses = scene.poses.with_name(NOISY_POSES)
+    by_pair, seconds = judged_run(method, scene.images, poses, scene.block, work, args.keypoints, jobs=1, start=start)
     if method != JUDGED:
         shutil.rmtree(work)
     found = [by_pair[pair.images] for pair in judged.pairs]
-    seconds = run.seconds / max(1, len(found))
-    return [{**{key: plain(float(row[key] or "nan")) for key in _FIGURES}, "seconds": seconds} for row in found]
+    return [{**row, "seconds": seconds / max(1, len(found))} for row in found]
 
 
 def _peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:

@@ -10,9 +10,11 @@ quarter of each class of view angle where a scene has as many.
 Correct: matches a pair within 3 px, after thinning them one-to-one to 2 px. Right: of the kept ones. Recall: of the
 keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. First / it:
 correct matches of the first of --methods over those of this one, on the same pairs. Error: median of the pairs'
-medians. Seconds: median of pairs, features of both images included, decoding too; start-up is not timed. In brackets:
-90 % intervals by bootstrap over pairs. OUT keeps what every method answered: what depends on nothing that changed is
-not made again.
+medians. Seconds: median of pairs, features of both images included, decoding too; start-up is not timed. A preset with
+further steps (`auto`), which decides by the whole block, is run on that once, as the command does it with the same
+poses: its learned features have half the descriptors beside those of SIFT, and its seconds are the run's, divided by
+all pairs. `:total` gives a peer as many as both together. In brackets: 90 % intervals by bootstrap over pairs. OUT
+keeps what every method answered: what depends on nothing that changed is not made again.
 """
 
 from __future__ import annotations
@@ -24,14 +26,27 @@ from pathlib import Path
 
 import numpy as np
 
+from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
+from aeromatch_cli.files import read_json, write_json
+from aeromatch_cli.fingerprints import fingerprint
 from benchmarks import options, stamps
 from benchmarks.peers.base import Options
-from benchmarks.peers.table import NEED_WEIGHTS, PEERS, Named, check_method, missing_weights, named_methods, settings_of
+from benchmarks.peers.table import (
+    NEED_WEIGHTS,
+    PEERS,
+    Named,
+    by_block,
+    check_method,
+    missing_weights,
+    named_methods,
+    settings_of,
+)
 from benchmarks.peers.worker import measure
 from benchmarks.processes import limit_threads
 from benchmarks.scenes import Judged, Selection, real, rendered_scenes
+from benchmarks.sources import OUR_CODE, code_digest
 from benchmarks.tables import (
     Column,
     Row,
@@ -49,6 +64,7 @@ from benchmarks.tables import (
     table,
     write_rows,
 )
+from benchmarks.whole import judged_run
 
 THREADS = 2
 ENOUGH_CORRECT = 30
@@ -75,14 +91,39 @@ def rows_of(args: argparse.Namespace, methods: Sequence[Named]) -> Iterator[Row]
     for judged in asked_scenes(args):
         for name in methods if judged.pairs else ():
             print(f"{judged.scene.name}: {name.label}, {len(judged.pairs)} pairs", file=sys.stderr, flush=True)
-            answers = measure(name.spec, judged, limits, args.out / "found")
-            for pair, (_, measured) in zip(judged.pairs, answers, strict=True):
-                found = measured.found
-                answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
-                score = judged.truth.judge(*pair.images, *answer).row()
+            found = (
+                _of_run(name.spec, judged, limits, args.out / "runs")
+                if by_block(name.spec)
+                else _of_pairs(name.spec, judged, limits, args.out / "found")
+            )
+            for pair, figures in zip(judged.pairs, found, strict=True):
                 head = {"method": name.label, "scene": judged.scene.name, "pair": " ".join(pair.images)}
                 head |= {"view_angle": class_of(pair.conditions.view_angle_deg, VIEW_ANGLE_CLASSES)}
-                yield {**head, **{key: plain(score[key]) for key in _FIGURES}, "seconds": plain(measured.seconds)}
+                yield {**head, **figures}
+
+
+def _of_pairs(spec: str, judged: Judged, limits: Options, store: Path) -> Iterator[Row]:
+    """Figures of a method that is given one pair after the other."""
+    for pair, (_, measured) in zip(judged.pairs, measure(spec, judged, limits, store), strict=True):
+        found = measured.found
+        answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
+        score = judged.truth.judge(*pair.images, *answer).row()
+        yield {**{key: plain(score[key]) for key in _FIGURES}, "seconds": plain(measured.seconds)}
+
+
+def _of_run(spec: str, judged: Judged, limits: Options, store: Path) -> Iterator[Row]:
+    """Figures of a preset that decides by the whole block, from one run of the command; its seconds are shared by all
+    pairs of the run."""
+    asked = [spec, load(*parse_method(spec)).model_dump(mode="json"), judged.key, limits.keypoints]
+    path = store / f"{fingerprint(asked, code_digest(*OUR_CODE))[:16]}.json"
+    if not path.is_file():
+        scene = judged.scene
+        rows, seconds = judged_run(
+            spec, scene.images, scene.poses, scene.block, store / "work", limits.keypoints, jobs=limits.threads
+        )
+        found = [{**rows[pair.images], "seconds": seconds / len(rows)} for pair in judged.pairs]
+        write_json(path, found)
+    yield from read_json(path)
 
 
 def _correct(rows: Sequence[Row]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from benchmarks.peers.kornia_peers import HARD_TFEAT, TFEAT, KeyNet
 from benchmarks.peers.opencv import OpenCvAsift, OpenCvSift
 from benchmarks.peers.ours import Preset
 from benchmarks.peers.published import LIGHTERGLUE, Disk, WithLightGlue, XFeat
+from benchmarks.peers.union import Union
 
 Make = Callable[[Scene, Options], Method]
 
@@ -43,13 +44,33 @@ FROM_PICTURES: Mapping[str, Make] = {
     "disk+lightglue": partial(WithLightGlue, features=Disk, weights=_OF_DISK),
     "xfeat+lighterglue": partial(WithLightGlue, features=XFeat, **LIGHTERGLUE),
 }
-ON_GROUND = "@ground"
-PEERS: Mapping[str, Make] = {
+ON_GROUND, TOTAL = "@ground", ":total"
+
+
+def _at_total(scene: Scene, options: Options, *, peer: Make) -> Method:
+    """With as many descriptors as the features of `auto` have together."""
+    return peer(scene, replace(options, keypoints=options.keypoints + options.keypoints // 2))
+
+
+_ALSO_AT_TOTAL = ("aliked+lightglue", "aliked+lightglue@ground")
+_OF_ONE_BUDGET: Mapping[str, Make] = {
     **FROM_PICTURES,
     "pycolmap": Colmap,
     "pycolmap-guided": partial(Colmap, guided=True),
     **{f"{name}{ON_GROUND}": partial(OnGround, peer=make) for name, make in FROM_PICTURES.items()},
 }
+PEERS: Mapping[str, Make] = {
+    **_OF_ONE_BUDGET,
+    **{f"{name}{TOTAL}": partial(_at_total, peer=_OF_ONE_BUDGET[name]) for name in _ALSO_AT_TOTAL},
+    "pycolmap+aliked": partial(Union, first=partial(Colmap, guided=True), second=FROM_PICTURES["aliked+lightglue"]),
+}
+
+
+def _features_of(spec: str) -> str:
+    """The name without what says how they are used."""
+    return spec.removesuffix(TOTAL).removesuffix(ON_GROUND)
+
+
 # Peers that are networks: the files of their weights.
 _KEYNET = ("OriNet.pth", "keynet_pytorch.pth")
 _WEIGHTS: Mapping[str, tuple[str, ...]] = {
@@ -61,19 +82,25 @@ _WEIGHTS: Mapping[str, tuple[str, ...]] = {
     "aliked-rot+lightglue": (f"{ALIKED_ROTATED}.pth", _OF_ALIKED),
     "disk+lightglue": ("disk-depth-save.pth", _OF_DISK),
     "xfeat+lighterglue": ("xfeat.pt", LIGHTERGLUE["weights"]),
+    "pycolmap+aliked": (f"{ALIKED}.pth", _OF_ALIKED),
 }
-NEED_WEIGHTS = tuple(name for name in PEERS if name.removesuffix(ON_GROUND) in _WEIGHTS)
+NEED_WEIGHTS = tuple(name for name in PEERS if _features_of(name) in _WEIGHTS)
 
 
 def missing_weights(spec: str, folder: Path | None) -> list[str]:
     """Names of files without which a method cannot be run; folder: of reference weights."""
-    files = _WEIGHTS.get(spec.removesuffix(ON_GROUND), ())
+    files = _WEIGHTS.get(_features_of(spec), ())
     return [name for name in files if weights_path(folder, name) is None]
 
 
 def reads_poses(spec: str) -> bool:
     """Whether a method's answers depend on the poses: presets, and peers on rectified views."""
-    return spec not in PEERS or spec.endswith(ON_GROUND)
+    return spec not in PEERS or spec.removesuffix(TOTAL).endswith(ON_GROUND)
+
+
+def by_block(spec: str) -> bool:
+    """Whether a method is a preset whose further steps are for the pairs of a block that need them."""
+    return spec not in PEERS and bool(load(*parse_method(spec)).cascade)
 
 
 @dataclass(frozen=True)
