@@ -107,7 +107,7 @@ class LearnedFeatures(Step):
         True,
         description="Match the step's features not only by nearest neighbours, but also by the LightGlue that belongs "
         "to them; that of own features gets each keypoint's place on the ground by the poses. It compares the 1024 "
-        "strongest descriptors of a view. false: fewer matches of difficult pairs, some tenths of a second less a pair.",
+        "strongest descriptors of a view. false: fewer matches of difficult pairs, a little less time.",
     )
     precision: Precision = _PRECISION
     device: Device = DEVICE
