@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sized
 
-# Names that a message gives of many.
-_NAMED = 5
+# Names that a message gives of many, and where a person goes through them.
+_NAMED, MANY = 5, 10
 
 
 def form(count: int, one: str, several: str = "") -> str:
@@ -13,10 +13,16 @@ def form(count: int, one: str, several: str = "") -> str:
     return one if count == 1 else several or f"{one}s"
 
 
-def listed(names: Iterable[object], shown: int = _NAMED) -> str:
-    """The first names and how many more there are: `a, b and 3 more`."""
+def listed(names: Iterable[object], shown: int = _NAMED, between: str = ", ") -> str:
+    """The first names and how many more there are: `a, b and 3 more`.
+
+    between: "; " where names hold commas or `and`.
+    """
     words = [str(name) for name in names]
-    return ", ".join(words[:shown]) + (f" and {len(words) - shown:,} more" if len(words) > shown else "")
+    if len(words) <= shown:
+        return between.join(words)
+    last = " and" if between == ", " else f"{between}and"
+    return f"{between.join(words[:shown])}{last} {len(words) - shown:,} more"
 
 
 def of_images(names: Iterable[object], total: Sized, one: str = "", several: str = "") -> str:
@@ -26,4 +32,4 @@ def of_images(names: Iterable[object], total: Sized, one: str = "", several: str
     """
     some = list(names)
     verb = f" {form(len(some), one, several)}" if one else ""
-    return f"{len(some)} of {len(total)} images ({listed(some)}){verb}"
+    return f"{len(some):,} of {len(total):,} images ({listed(some)}){verb}"

@@ -180,7 +180,12 @@ def test_the_stage_writes_what_was_asked_together(matcher: Together, tmp_path: P
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 @pytest.mark.parametrize(
     ("preset", "setting"),
-    [("fusion", "match.device"), ("oblique", "extract.device"), ("auto", "cascade.learned.device")],
+    [
+        ("fusion", "match.device"),
+        ("oblique", "extract.device"),
+        ("oblique", "match.device"),
+        ("auto", "cascade.learned.device"),
+    ],
 )
 def test_a_device_that_is_not_there_is_named(preset: str, setting: str) -> None:
     strategies = list(chosen_strategies(load(preset, [f"{setting}=cuda"])))

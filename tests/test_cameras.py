@@ -19,7 +19,6 @@ from aeromatch_cli.geometry.cameras import (
     as_brown,
     calibration_matrix,
     colmap_camera,
-    colmap_params,
     corner_params,
     distort,
     focal_px,
@@ -93,7 +92,7 @@ def test_colmap_parameters_round_trip(model: str) -> None:
 def test_cameras_survive_colmap(model: str) -> None:
     camera = IN_COLMAP[model]
     name, params = colmap_camera(camera)
-    assert params == colmap_params(camera)
+    assert params == colmap_camera(camera)[1]
     assert from_colmap(name, WIDTH_PX, HEIGHT_PX, params) == camera
 
 

@@ -89,9 +89,13 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
                 "filter": {"components": [2, 1, 1]},
                 "adjust": {"groups": [{"kind": "level", "images": n} for n in (9, 3, 2)], "positions_given": 0},
             },
-            ["bad: 3 groups", "2 parts (3, 2 images) have frames of their own", "export=colmap writes a model of each"],
+            [
+                "bad: 3 groups",
+                "2 parts (images: 3, 2) have frames of their own",
+                "export=colmap writes a model of each",
+            ],
         ),
-        ({"adjust": {"groups": [PLACED] * 2}}, ["doubtful: 2 parts (4, 4 images) share too few points"]),
+        ({"adjust": {"groups": [PLACED] * 2}}, ["doubtful: 2 parts (images: 4, 4) share too few points"]),
         ({"adjust": {"images": 0}}, ["good: all 4 images are connected", "not checked: orientation: orient=none"]),
         (
             {"adjust": {"images": 0, "remarks": ["not done: no image is oriented"]}},

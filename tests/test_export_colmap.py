@@ -17,7 +17,7 @@ import pytest
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import WorkspaceError
-from aeromatch_cli.geometry.cameras import colmap_params, project
+from aeromatch_cli.geometry.cameras import colmap_camera, project
 from aeromatch_cli.geometry.epipolar import essential, fundamental_from_poses, relative_pose
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_quaternion
 from aeromatch_cli.geometry.warps import undistorted_from_ground
@@ -135,7 +135,7 @@ def test_summary_counts(truth: Truth, exported: tuple[Path, ExportSummary]) -> N
 def test_cameras_and_images_read_back(truth: Truth, database: Any) -> None:
     cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
     assert [cameras[i].model.name for i in (1, 2)] == ["OPENCV", "SIMPLE_RADIAL"]
-    np.testing.assert_array_equal(cameras[1].params, colmap_params(CAMERA_A))
+    np.testing.assert_array_equal(cameras[1].params, colmap_camera(CAMERA_A)[1])
     assert (cameras[1].params[2], cameras[1].params[3]) == (503.7, 371.6)
     assert [cameras[i].has_prior_focal_length for i in (1, 2)] == [True, False]  # "b" was declared a guess
     names = {image.image_id: (image.name, image.camera_id) for image in database.read_all_images()}

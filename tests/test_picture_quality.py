@@ -159,7 +159,7 @@ def test_blurred_pictures_are_named_before_the_long_stages_and_left_out_where_as
     path = site.images / names[3]
     cv2.imwrite(str(path), cv2.GaussianBlur(cv2.imread(str(path)), (0, 0), 4.0))
     said = site("pairs", "--set", "orient=none")
-    assert f"1 of {len(names)} images ({names[3]} (0." in said.stderr
+    assert f"1 of {len(names)} images ({names[3]}: 0." in said.stderr
     assert ") is far more blurred than others of the same camera: " in said.stderr
     figures = read_picture_quality(site.work / "images.csv")
     assert len(figures) == len(names)
@@ -198,7 +198,7 @@ def test_a_damaged_picture_is_named_once_and_not_by_the_decoder(site: Site, capf
 def test_small_copies_of_pictures_are_named() -> None:
     sizes = {"a.jpg": (4000, 3000), "thumbs/a.jpg": (160, 120), "b.JPG": (4000, 3000), "b_thumb.jpg": (640, 480)}
     (said,) = thumbnails(sizes)
-    assert said.startswith("2 of 4 images (thumbs/a.jpg (160 x 120), b_thumb.jpg (640 x 480)) are small copies")
+    assert said.startswith("2 of 4 images (thumbs/a.jpg: 160 x 120, b_thumb.jpg: 640 x 480) are small copies")
     thermal = {"DJI_1_W.JPG": (4000, 3000), "DJI_1_T.JPG": (640, 512), "x/1.jpg": (640, 512), "y/1.jpg": (4000, 3000)}
     assert thumbnails(thermal) == []
     assert thumbnails({"x/1.jpg": (2000, 1500), "y/1.jpg": (4000, 3000)}) == []

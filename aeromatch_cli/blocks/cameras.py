@@ -172,8 +172,8 @@ def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str])
     guessed = [name for name, source in sources.items() if source == "guess"]
     warnings = (
         (
-            f"the focal length of {len(guessed)} of {len(facts)} images is a guess ({GUESSED_FOCAL_FACTOR} x the "
-            f"longer side), since EXIF says too little ({listed(guessed)}): better give --cameras FILE",
+            f"the focal length of {of_images(guessed, facts)} is a guess ({GUESSED_FOCAL_FACTOR} x the longer side), "
+            "since EXIF says too little: better give --cameras FILE",
         )
         if guessed
         else ()

@@ -258,7 +258,7 @@ def _remarks_on_marks(path: Path, absent: Sequence[str], twice: list[str]) -> li
     """Return what is said of measurements in images that the block does not have, and of repeated ones."""
     remarks = []
     if absent:
-        count = f"{len(absent)} image{'s' if len(absent) > 1 else ''}"
+        count = f"{len(absent)} {form(len(absent), 'image')}"
         remarks.append(f"{path.name} names {count} that the block does not have: {listed(sorted(absent))}")
     if twice:
         remarks.append(f"{path.name} measures points twice in an image: the first counts: {listed(twice)}")

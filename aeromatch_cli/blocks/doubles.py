@@ -56,7 +56,7 @@ def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
     pairs = [same for same in twins(sizes_px) if len({sizes_px[name] for name in same}) == 1]
     if not pairs:
         return []
-    shown = listed([" and ".join(same) for same in pairs])
+    shown = listed((" and ".join(same) for same in pairs), between="; ")
     what = form(len(pairs), "picture is", "pictures are")
     return [f"{len(pairs)} {what} there in two formats ({shown}): remove one of each"]
 
@@ -73,7 +73,7 @@ def thumbnails(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
             own = sizes_px[name]
             alike = abs(own[0] * height_px - own[1] * width_px) <= _ROUNDED_PX * max(width_px, height_px)
             if alike and _SMALLER * max(own) <= max(width_px, height_px):
-                small.append(f"{name} ({own[0]} x {own[1]})")
+                small.append(f"{name}: {own[0]} x {own[1]}")
     if not small:
         return []
     what = of_images(small, sizes_px, "is a small copy", "are small copies")

@@ -81,10 +81,10 @@ def _places_warning(names: Names, positions_m: FloatArray) -> list[str]:
         return []
     middles_m = np.array([np.median(positions_m[labels == n], axis=0) for n in range(count)])
     farthest_km = max(float(np.linalg.norm(middles_m - middle, axis=1).max()) for middle in middles_m) / 1000.0
-    shown = "; ".join(_some(names[labels == n]) for n in range(min(count, _PLACES_SHOWN)))
-    more, up_to = ("; ..." if count > _PLACES_SHOWN else ""), ("up to " if count > 2 else "")
+    shown = listed((_some(names[labels == n]) for n in range(count)), _PLACES_SHOWN, "; ")
+    up_to = "up to " if count > 2 else ""
     return [
-        f"the positions lie in {count} places {up_to}{farthest_km:,.0f} km apart: {shown}{more}. "
+        f"the positions lie in {count} places {up_to}{farthest_km:,.0f} km apart: {shown}. "
         "Images of different places show no common ground and are not paired by position: run each place by itself; "
         "if all are of one flight, check exchanged coordinates (x and y, lat and lon) and --crs"
     ]
@@ -195,4 +195,4 @@ def _all_zero(rotations: Sequence[FloatArray]) -> bool:
 
 def _some(names: Sequence[str] | Names) -> str:
     """How many images, and the first of them by name."""
-    return f"{len(names)} {form(len(names), 'image')} ({listed(names)})"
+    return f"{len(names):,} {form(len(names), 'image')} ({listed(names)})"

@@ -21,7 +21,7 @@ from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.store.matches import match_points
 from aeromatch_cli.store.opened import OpenedBlock
-from aeromatch_cli.words import of_images
+from aeromatch_cli.words import form, of_images
 from aeromatch_cli.workspace import Workspace
 
 # Pairs that truly share this much count, whether they were tried or not.
@@ -119,7 +119,7 @@ def _judged(
     # Every image of a rendered block has its truth; an adjustment may have left some out.
     if len(known) < 2 or (unknown and truth.kind == "rendered"):
         raise InputError(
-            f"{of_images(unknown, images, 'is', 'are')} of the workspace, but not in the truth "
+            f"{of_images(unknown, images)} of the workspace {form(len(unknown), 'is', 'are')} not in the truth "
             f"{truth_folder}: give the truth of the same block"
         )
     for image in known:

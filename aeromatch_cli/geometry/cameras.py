@@ -313,11 +313,6 @@ def colmap_camera(camera: Camera) -> tuple[str, tuple[float, ...]]:
     return model, tuple(named[name] for name in names)
 
 
-def colmap_params(camera: Camera) -> tuple[float, ...]:
-    """Parameters of colmap_camera."""
-    return colmap_camera(camera)[1]
-
-
 def poselib_camera(camera: Camera) -> dict[str, Any]:
     """The camera of undistorted pixels in PoseLib's words, which know no skew: of pixels by without_skew."""
     p = parameters(camera)

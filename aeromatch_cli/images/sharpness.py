@@ -25,8 +25,6 @@ _PARTS, _PART_PX = 4, 256
 _LENGTH_PX = 9
 # Parts of less than this share of the picture's usual differences have nothing to be sharp, but noise.
 _LEAST_CONTRAST = 0.5
-# Of the others this share is more focused than what counts.
-_MOST_FOCUSED = 0.5
 # Values that show nothing, of 0 to 255, and the share of a picture that may have them.
 _BLACK, _WHITE, _NOTHING = 12, 243, 0.85
 # Blur beyond that of so many pictures before and behind, or of all of the camera; beyond so many standard deviations of

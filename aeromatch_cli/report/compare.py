@@ -20,7 +20,7 @@ from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.settings_diff import said_value
 from aeromatch_cli.stages.stage_report import result_on_file
 from aeromatch_cli.store.opened import OpenedBlock
-from aeromatch_cli.words import form, listed
+from aeromatch_cli.words import MANY, form, listed
 from aeromatch_cli.workspace import Workspace
 
 # Differences that are not chance, as a share of the larger value.
@@ -190,7 +190,7 @@ def _image_lines(one: _Side, two: _Side) -> Iterator[str]:
         ("only in the second", two.images.keys() - one.images.keys()),
     ):
         if names:
-            yield f"            {words}: {listed(sorted(names))}"
+            yield f"            {words}: {listed(sorted(names), MANY)}"
 
 
 def _match_lines(one: _Side, two: _Side) -> Iterator[str]:
@@ -199,7 +199,8 @@ def _match_lines(one: _Side, two: _Side) -> Iterator[str]:
     yield _counts("verified", len(verified[0]), len(verified[1]))
     for words, pairs in (("lost", verified[0] - verified[1]), ("gained", verified[1] - verified[0])):
         if pairs:
-            yield f"            {len(pairs)} {words}: {listed('-'.join(pair) for pair in sorted(pairs))}"
+            named = listed((" and ".join(pair) for pair in sorted(pairs)), MANY, "; ")
+            yield f"            {len(pairs)} {words}: {named}"
     yield _counts("matches", sum(one.matches.values()), sum(two.matches.values()))
     both = sorted(verified[0] & verified[1])
     ratios = [two.matches[pair] / one.matches[pair] for pair in both]

@@ -44,7 +44,7 @@ from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.stage_report import result_of, result_on_file
 from aeromatch_cli.store.matches import match_points
 from aeromatch_cli.store.opened import OpenedBlock
-from aeromatch_cli.words import form
+from aeromatch_cli.words import form, listed
 from aeromatch_cli.workspace import Workspace
 
 # Partners that are listed one by one.
@@ -80,8 +80,11 @@ class _Work(OpenedBlock):
         ]  # fmt: skip
         exact = [image for image in fitting if image.name == text]
         if len(exact or fitting) != 1:
-            several = ", ".join(image.name for image in fitting[:3])
-            what = f"fits several images ({several})" if fitting else "is none of the images"
+            what = (
+                f"fits several images ({listed(image.name for image in fitting)})"
+                if fitting
+                else "is none of the images"
+            )
             example = next(iter(self.images.values())).name if self.images else "none"
             raise ConfigError(f"{text!r} {what} of {self.workspace.root}: give a name such as {example}")
         return (exact or fitting)[0]

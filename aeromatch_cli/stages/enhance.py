@@ -26,10 +26,6 @@ from aeromatch_cli.store.block_store import BlockStore
 from aeromatch_cli.strategies import Enhanced, Enhancer
 from aeromatch_cli.workspace import Workspace
 
-# Among a stage's facts: how many images are not enhanced because they and those they are paired with were taken under
-# the same illumination.
-SKIPPED = "images_skipped_same_illumination"
-
 
 @dataclass(frozen=True, eq=False)
 class EnhanceTask:

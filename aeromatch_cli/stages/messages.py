@@ -21,7 +21,7 @@ from aeromatch_cli.sfm.control import offset_words
 from aeromatch_cli.sfm.mapping import Group
 from aeromatch_cli.stages.filter import WEAK_MATCHES
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.words import form, listed
+from aeromatch_cli.words import MANY, form, listed
 
 # What a control figure is of, in words.
 _CHECKED = {"check points": "check points", "leave one out": "each control point, fitted without it"}
@@ -96,14 +96,14 @@ def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) 
     if part:
         return lines
     if found.unread:
-        lines.append(f"could not be read: {listed([names[i] for i in found.unread])}")
+        lines.append(f"could not be read: {listed((names[i] for i in found.unread), MANY)}")
     components = found.components
     if len(components) > 1:
-        lines.append(f"{len(components)} unconnected groups of images, of sizes {listed(components)}")
+        lines.append(f"{len(components)} unconnected groups of images, of sizes {listed(components, MANY)}")
     else:
         lines.append("all images are connected")
     if found.weakly_tied:
-        lines.append(f"weakly tied (< {WEAK_MATCHES} matches): {listed([names[i] for i in found.weakly_tied])}")
+        lines.append(f"weakly tied (< {WEAK_MATCHES} matches): {listed((names[i] for i in found.weakly_tied), MANY)}")
     return lines
 
 
@@ -118,11 +118,11 @@ def orientation_lines(found: OrientResult, given: Block, block: Block) -> list[s
     given_wrongly = ("attitudes", "degrees", found.wrong_attitudes), ("positions", "m", found.wrong_positions)
     for what, unit, wrong in given_wrongly:
         if wrong:
-            named = listed([f"{names[i]} ({value:.0f} {unit})" for i, value in wrong.items()])
+            named = listed((f"{names[i]} ({value:.0f} {unit})" for i, value in wrong.items()), MANY)
             done = "kept, as orient=given asks" if found.stays else "those that the pictures give are used"
             words.append(f"wrong {what} given; {done}: {named}")
     if found.outside:
-        words.append(f"not oriented: {listed([names[i] for i in found.outside])}")
+        words.append(f"not oriented: {listed((names[i] for i in found.outside), MANY)}")
     return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]
 
 
@@ -197,7 +197,7 @@ def _adjust_lines(found: AdjustResult, images: int, names: Mapping[str, str]) ->
         f"{found.track_length:.1f} images each, reprojection error {error_px}"
     ]
     if len(found.groups) > 1:
-        sizes = ", ".join(str(group.images) for group in found.groups)
+        sizes = listed((group.images for group in found.groups), MANY)
         words.append(f"{len(found.groups)} groups of images, each oriented by itself: {sizes}")
     words += control_words(found.control, control_of(found.groups))
     words += found.remarks

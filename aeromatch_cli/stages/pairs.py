@@ -27,6 +27,7 @@ from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, forget_absent, result_on_file
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.matchers.lightglue.learned import LearnedLightGlue
 from aeromatch_cli.workspace import Workspace
 
 log = logging.getLogger("aeromatch")
@@ -203,6 +204,18 @@ def _check_settings(settings: Settings) -> None:
         )
     for strategy in chosen_strategies(settings):
         strategy.check_files(settings.extract.descriptor_length)
+    _check_descriptors(settings)
+
+
+def _check_descriptors(settings: Settings) -> None:
+    """Raise ConfigError where LightGlue does not know the user's own descriptors."""
+    match = settings.match
+    own = [path for path in settings.extract.own_weights() if Path(path).stem in ("geodesc", "context")]
+    if own and isinstance(match, LearnedLightGlue) and match.weights is None:
+        raise ConfigError(
+            f"match={match.name} was trained on the descriptors that ship, not on those of {own[0]}: give "
+            "match.weights that were trained on these, or set match=bidirectional"
+        )
 
 
 def chosen_strategies(settings: Settings) -> Iterator[Strategy]:

@@ -51,7 +51,7 @@ def remarks(context: Context, found: Mapping[str, PictureQuality]) -> list[str]:
     names = {image.image_id: image.name for image in images}
     for image in images:
         if complaint := found[image.image_id].damage:
-            kinds["damaged, and partly gray or noise perhaps"].append(f"{image.name} ({complaint})")
+            kinds["damaged, and partly gray or noise perhaps"].append(f"{image.name}: {complaint}")
         nothing = shows_nothing(found[image.image_id])
         if nothing:
             kinds[f"almost {nothing}"].append(image.name)
@@ -59,7 +59,7 @@ def remarks(context: Context, found: Mapping[str, PictureQuality]) -> list[str]:
             cameras[image.camera_id].append(image.image_id)
     for ids in cameras.values():
         kinds["far more blurred than others of the same camera"] += [
-            f"{names[ids[k]]} ({found[ids[k]].blur:.2f})" for k in unsharp([found[i].blur for i in ids])
+            f"{names[ids[k]]}: {found[ids[k]].blur:.2f}" for k in unsharp([found[i].blur for i in ids])
         ]
     return [
         f"{of_images(some, context.block.images, 'is', 'are')} {what}: {_REMEDY}"

@@ -60,7 +60,7 @@ from aeromatch_cli.stages.within import (
     without_steps,
 )
 from aeromatch_cli.store.index import Index
-from aeromatch_cli.words import form
+from aeromatch_cli.words import of_images
 from aeromatch_cli.workspace import Workspace, locked
 
 log = logging.getLogger("aeromatch")
@@ -357,13 +357,13 @@ def _tell_left_out(context: Context, read: StageReport, left_out: list[str]) -> 
 
 def _without_keypoints(context: Context) -> str:
     """Say of a block none of whose pairs is verified how many images show nothing to match, and what may hide it."""
-    paths = [context.workspace.features(image.image_id) for image in context.block.images]
-    empty = sum(path.is_file() and not len(read_keypoints(path)[0]) for path in paths)
+    made = {image.name: context.workspace.features(image.image_id) for image in context.block.images}
+    empty = [name for name, path in made.items() if path.is_file() and not len(read_keypoints(path)[0])]
     if not empty:
         return ""
     masks = context.settings.block.masks
     hidden = f"; do the masks {masks} hide them? white is used, black is ignored" if masks else ""
-    return f"; {empty} of {len(paths)} images {form(empty, 'has', 'have')} no keypoints{hidden}"
+    return f"; {of_images(empty, made, 'has', 'have')} no keypoints{hidden}"
 
 
 def _to_filter(context: Context, deadline: Deadline | None) -> tuple[Context, list[StageReport]]:

@@ -21,6 +21,7 @@ from aeromatch_cli.formats.reading import say_damaged
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.store.index import Index
+from aeromatch_cli.words import form, listed
 from aeromatch_cli.workspace import Workspace
 
 log = logging.getLogger("aeromatch")
@@ -122,9 +123,12 @@ class BlockStore:
         record = read_record(self.workspace.stage_report(stage), StageRecord)
         changed = [] if record is None else self.changed(self.workspace.root, record.files)
         if changed:
-            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-            words = "was changed or removed since it was written, and counts as absent"
-            log.warning("warning: %s%s %s", self.workspace.root / changed[0], more, words)
+            one, several = (
+                "was changed or removed since it was written, and counts",
+                "were changed or removed, and count",
+            )
+            words = form(len(changed), one, several)
+            log.warning("warning: %s %s as absent", listed((self.workspace.root / name for name in changed), 1), words)
         return None if changed else record
 
     def changed(self, folder: Path, digests: Mapping[str, str]) -> list[str]:

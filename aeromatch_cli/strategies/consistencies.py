@@ -53,7 +53,8 @@ class BlockConsistency(Strategy):
         ge=0.0,
         lt=1.0,
         description="Matches that are at least as likely to be right as this stay, whatever min_expected_right asks "
-        "for: images that no third one overlaps have few that are surer. Larger: fewer matches, fewer of them wrong.",
+        "for: few matches of images that only one other overlaps are surer. Larger: where min_expected_right is not "
+        "reached, fewer matches, fewer of them wrong.",
     )
     min_matches: int = Field(
         15,

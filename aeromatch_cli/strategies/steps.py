@@ -78,7 +78,7 @@ _PRECISION: Precision = Field(
 
 
 class LearnedFeatures(Step):
-    """Learned keypoints and descriptors on ground views, the ratio test from both images or LightGlue, guided search.
+    """Learned keypoints and descriptors on ground views, the ratio test from both images, LightGlue, guided search.
 
     Views are halved as by `extract=learned` itself, but never where `extract.pixels_per_keypoint` is 0.
     """
@@ -101,12 +101,13 @@ class LearnedFeatures(Step):
     features: Literal["own", "aliked"] = Field(
         "own",
         description="Features of the package's own networks, or of ALIKED, which others have published "
-        "(`aeromatch weights list` says whether its weights are there), with the LightGlue that belongs to them.",
+        "(`aeromatch weights list` says whether its weights are there), on the processor in 32 bits.",
     )
     lightglue: bool = Field(
         True,
-        description="Match the step's features by LightGlue, which is told where the poses expect each keypoint, as "
-        "well as by nearest neighbours. false: fewer matches of difficult pairs, half a second less per pair.",
+        description="Match the step's features not only by nearest neighbours, but also by the LightGlue that belongs "
+        "to them; that of own features gets each keypoint's place on the ground by the poses. It compares the 1024 "
+        "strongest descriptors of a view. false: fewer matches of difficult pairs, a little less time.",
     )
     precision: Precision = _PRECISION
     device: Device = DEVICE

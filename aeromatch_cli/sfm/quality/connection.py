@@ -17,7 +17,7 @@ from aeromatch_cli.sfm.quality.finding import (
     positions_given,
     rms,
 )
-from aeromatch_cli.words import form, listed
+from aeromatch_cli.words import MANY, form, listed
 
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
@@ -42,7 +42,7 @@ def connection(evidence: QualityInput) -> Iterator[Finding]:
     if len(sizes) == 1:
         yield Finding("connection", 0.0, 0.0, "good", "all images are connected")
         return
-    words = f"{len(sizes)} groups of images ({listed(sizes)}) that no verified pair connects"
+    words = f"{len(sizes)} groups of images ({listed(sizes, MANY)}) that no verified pair connects"
     if 0 < evidence.components_before < len(sizes):
         before = "one" if evidence.components_before == 1 else f"{evidence.components_before}"
         words += f", {before} before the stage consistency dropped matches"
@@ -168,7 +168,7 @@ def _placed_parts(evidence: QualityInput) -> Iterator[Finding]:
 def _loose_parts(images: Sequence[int]) -> Finding:
     """Say that parts which no pair ties to the others lie in frames of their own. images: of each."""
     if len(images) == 1:
-        words, them = f"1 part ({images[0]} images) has a frame of its own", "it"
+        words, them = f"1 part ({images[0]} {form(images[0], 'image')}) has a frame of its own", "it"
     else:
         words, them = f"{_sizes(images)} have frames of their own", "each"
     words += (
@@ -179,7 +179,7 @@ def _loose_parts(images: Sequence[int]) -> Finding:
 
 
 def _sizes(parts: Sequence[int]) -> str:
-    return f"{len(parts)} parts ({listed(parts)} images)"
+    return f"{len(parts)} parts (images: {listed(parts, MANY)})"
 
 
 def kept_poses(evidence: QualityInput) -> Found:

@@ -89,9 +89,9 @@ class QualityInput(Record):
         """Parameter of cameras -> setting that holds it."""
         return self.adjust.held_by
 
-    def named(self, image_ids: Sequence[str], most: int = 5) -> str:
-        """List images by the names of their files, at most so many of them."""
-        return listed((self.names.get(i, i) for i in image_ids), most)
+    def named(self, image_ids: Sequence[str]) -> str:
+        """List images by the names of their files."""
+        return listed(self.names.get(i, i) for i in image_ids)
 
 
 def part_words(group: GroupResult, groups: Sequence[GroupResult], names: Mapping[str, str]) -> str:

@@ -235,7 +235,7 @@ class EveryPair(Attention):
     network_below_matches: int = network_below_field(_EVERY)
 
     def scan(self, comparison: Comparison) -> Found:
-        """The ratio test from either image, as `Bidirectional` has it in the preset oblique."""
+        """The ratio test from either image, as `Bidirectional` has it."""
         return ratio_test_both_ways(comparison, _LEARNED_RATIO)
 
 
