@@ -33,11 +33,11 @@ class Standing:
 
 
 STANDING: Mapping[str, Standing] = {
-    "auto": Standing("auto.md", 58, ("auto rendered", "auto strategies", "auto real --data DATA")),
+    "auto": Standing("auto.md", 52, ("auto rendered", "auto strategies", "auto real --data DATA")),
     "claims": Standing("claims.md", 12, ("claims --seed 1 --data DATA --reference-weights WEIGHTS",)),
     "peers": Standing(
         "peers.md",
-        15,
+        19,
         (
             "peers rendered --reference-weights WEIGHTS",
             "peers real --data DATA --reference-weights WEIGHTS",

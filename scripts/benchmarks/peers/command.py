@@ -122,8 +122,8 @@ def _of_run(spec: str, judged: Judged, limits: Options, store: Path) -> Iterator
             spec, scene.images, scene.poses, scene.block, store / "work", limits.keypoints, jobs=limits.threads
         )
         found = [{**rows[pair.images], "seconds": seconds / len(rows)} for pair in judged.pairs]
-        write_json(path, found)
-    yield from read_json(path)
+        write_json(path, {"rows": found})
+    yield from read_json(path)["rows"]
 
 
 def _correct(rows: Sequence[Row]) -> str:
