@@ -152,13 +152,13 @@ def test_what_cannot_be_measured_is_refused(capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.slow
 def test_a_strategy_goes_on_from_the_workspace_of_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[Path | None] = []
-    run = runs.whole_run
+    run = runs.judged_run
 
     def watched(*given: Any, **more: Any) -> Any:
         started.append(more["start"])
         return run(*given, **more)
 
-    monkeypatch.setattr(runs, "whole_run", watched)
+    monkeypatch.setattr(runs, "judged_run", watched)
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_LOG_LEVEL"):
         monkeypatch.setenv(name, "1")
     asked = ["auto", "strategies", "--quick", "--places", "suburb:nadir", "--jobs", "1", "--out", str(tmp_path)]

@@ -68,7 +68,9 @@ def test_half_of_the_digits_are_enough_for_a_file(tmp_path: Path) -> None:
 
 def test_differences_are_counted_and_shapes_given() -> None:
     wanted = nn.Sequential(*(nn.Linear(2, 2) for _ in range(3))).state_dict()
-    with pytest.raises(ValueError, match=r"^missing: 0\.bias, 0\.weight, 1\.bias and 3 more; unexpected: other$"):
+    with pytest.raises(
+        ValueError, match=r"^missing: 0\.bias, 0\.weight, 1\.bias, 1\.weight, 2\.bias and 1 more; unexpected: other$"
+    ):
         check_same_tensors(wanted, {"other": torch.zeros(1)})
     with pytest.raises(ValueError, match=r"^wrong shape: 0\.weight \(1, 2\) instead of \(2, 2\)$"):
         check_same_tensors(wanted, wanted | {"0.weight": torch.zeros(1, 2)})

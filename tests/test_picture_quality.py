@@ -189,7 +189,8 @@ def test_a_damaged_picture_is_named_once_and_not_by_the_decoder(site: Site, capf
     outcome = site("pairs", "--set", "orient=none", "--poses", "none", "--set", "pairs=exhaustive")
     said = [line for line in outcome.stderr.splitlines() if "Corrupt JPEG data" in line]
     assert len(said) == 1
-    assert f"images is damaged, and partly gray or noise perhaps: {damaged.name} (Corrupt JPEG data" in said[0]
+    assert f"images ({damaged.name}: Corrupt JPEG data" in said[0]
+    assert ") is damaged, and partly gray or noise perhaps: " in said[0]
     sound = cv2.imencode(".jpg", picture)[1].tobytes()
     damaged.write_bytes(sound)
     assert read_quality(damaged).damage == ""

@@ -81,6 +81,9 @@ def test_the_summary_names_own_weights_and_only_those(site):
     lines = site("pairs", *learned).stdout.splitlines()[:-1]
     assert [line for line in lines if "weights" in line] == [f"own weights      {own}/geodesc.safetensors"]
     assert "own weights" not in site("pairs", "--set", "extract=learned").stdout
+    refused = site("pairs", *learned, "--set", "match=lightglue-learned")
+    assert refused.code == 2
+    assert f"not on those of {own}/geodesc.safetensors: give match.weights" in refused.stderr
 
 
 # --- configuration ------------------------------------------------------------------------------------------------

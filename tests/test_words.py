@@ -15,12 +15,26 @@ from aeromatch_cli.data import Pair
 from aeromatch_cli.report.rows import _details
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, FilterResult
 from aeromatch_cli.stages import messages, unregistered
-from aeromatch_cli.words import form
+from aeromatch_cli.words import MANY, form, listed, of_images
 
 
 def test_forms() -> None:
     assert [form(count, "pair") for count in (0, 1, 2)] == ["pairs", "pair", "pairs"]
     assert [form(count, "is", "are") for count in (0, 1, 2)] == ["are", "is", "are"]
+
+
+def test_lists_name_the_first_and_count_the_rest() -> None:
+    assert listed([]) == ""
+    assert listed("abcde") == "a, b, c, d, e"
+    assert listed(str(number) for number in range(1_006)) == "0, 1, 2, 3, 4 and 1,001 more"
+    assert listed(range(11), MANY) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 1 more"
+    assert listed(["a and b", "c and d", "e and f"], 2, "; ") == "a and b; c and d; and 1 more"
+
+
+def test_images_are_counted_and_named_before_the_verb() -> None:
+    assert of_images("a", range(1_200)) == "1 of 1,200 images (a)"
+    assert of_images("a", "abc", "is", "are") == "1 of 3 images (a) is"
+    assert of_images((name for name in "ab"), "abc", "is", "are") == "2 of 3 images (a, b) are"
 
 
 def _reasons(monkeypatch: pytest.MonkeyPatch, pairs: Mapping[tuple[str, str], bool], oriented: str) -> dict[str, str]:
