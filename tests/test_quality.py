@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 from make_results import filled
 
+from aeromatch_cli.results.stages import ConsistencyResult
 from aeromatch_cli.sfm.quality.finding import Finding, Quality, QualityInput, plain
 from aeromatch_cli.sfm.quality.judgement import judged
+from aeromatch_cli.stages.quality import _contradicted
 
 CALIBRATED = {"images": 12, "correlations": [], "parameters": {
     "f": [3010.0, 1.0, 3000.0, 30.0], "cx": [2005.0, 0.4, 1999.5, 80.0], "k1": [-0.01, 0.001, 0.0, 0.05],
@@ -323,3 +325,13 @@ def test_errors_of_positions_are_those_of_the_table() -> None:
     assert (
         up.sentence == "positions are met vertically to 0.165 m (root mean square in Z), 0.0 times what is stated, 5 m"
     )
+
+
+@pytest.mark.parametrize(
+    ("contradicting", "share"),
+    [(5, 0.05), (None, 0.3)],
+    ids=["unlikely matches speak against no block", "of a result that does not tell them apart all count"],
+)
+def test_only_what_contradicts_the_block_speaks_against_it(contradicting: int | None, share: float) -> None:
+    found = ConsistencyResult(verified_matches=70, dropped_matches=30, contradicting_matches=contradicting)
+    assert _contradicted(found) == pytest.approx(share)

@@ -264,6 +264,9 @@ class ConsistencyResult(StageResult):
     unconnected: list[str] = Field([], description="Images with no final match.")
     unread: list[str] = Field([], description=UNREAD)
     dropped_matches: int = Field(0, description="Matches that contradict the adjusted block or are unlikely.")
+    contradicting_matches: int | None = Field(
+        None, description="Those that contradict the adjusted block; the others are unlikely."
+    )
     rejected_pairs: int = Field(0, description="Pairs all of whose matches were dropped.")
     expected_right: float | None = Field(None, description="Share (0-1) of the final ones that is right to 3 px.")
     doubtful: list[str] = Field([], description="Images that the block seems to hold in a wrong place.")

@@ -70,12 +70,14 @@ class Limits:
 class Contradictions:
     """Holds what contradicts the block.
 
-    masks: of every pair, which matches (M,) do. doubtful: image ids whose adjusted poses too many of their matches
+    masks: of every pair, which matches (M,) do, or are not likely to be right. by_distance: number of those that do.
+    doubtful: image ids whose adjusted poses too many of their matches
     contradict: there the block is wrong, and none of their matches counts as contradicting. expected_right: the share
     of the matches left that is right to 3 pixels, by their probabilities; None where these were not asked for.
     """
 
     masks: list[BoolArray]
+    by_distance: int
     doubtful: list[str]
     expected_right: float | None
 
@@ -116,6 +118,7 @@ def contradicting(
         np.zeros(len(pair.indices), dtype=bool) if mask is None else mask.copy()
         for pair, mask in zip(pairs, masks, strict=True)
     ]
+    by_distance = sum(int(mask.sum()) for mask in found)
     if limits.by_probability:
         usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
         likely = [None if evidence is None else probabilities(evidence, usual_px) for evidence in known]
@@ -127,7 +130,8 @@ def contradicting(
                 mask[~mask] = ~keep
                 left.append(p[keep])
     judged = np.concatenate(left)
-    return Contradictions(found, sorted(settled.doubtful), float(judged.mean()) if len(judged) else None)
+    expected_right = float(judged.mean()) if len(judged) else None
+    return Contradictions(found, by_distance, sorted(settled.doubtful), expected_right)
 
 
 @dataclass(frozen=True, eq=False)

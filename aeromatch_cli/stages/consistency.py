@@ -80,6 +80,7 @@ def run(context: Context) -> StageReport:
     report.result = ConsistencyResult(
         verified_matches=left.verified_matches,
         dropped_matches=matches - left.verified_matches,
+        contradicting_matches=found.by_distance,
         rejected_pairs=left.pairs.get("rejected", 0),
         components=left.components,
         weakly_tied=left.weakly_tied,

@@ -53,11 +53,15 @@ def _positions_hide_pairs(results: BlockResults, images: int) -> bool:
 
 
 def _contradicted(consistency: ConsistencyResult) -> float | None:
-    """Share of the verified matches that the stage has dropped; None where it has judged none."""
+    """Share of the verified matches that contradict the adjusted block; None where the stage has judged none.
+
+    Those that are only unlikely do not count: how many they are follows from the share that is asked to be right.
+    """
     if consistency.verified_matches is None:
         return None
+    wrong = consistency.contradicting_matches
     matches = consistency.dropped_matches + consistency.verified_matches
-    return consistency.dropped_matches / matches if matches else None
+    return (consistency.dropped_matches if wrong is None else wrong) / matches if matches else None
 
 
 def results_of(workspace: Workspace, reports: Sequence[StageReport] = ()) -> BlockResults:
