@@ -124,7 +124,7 @@ def test_missing_tensors_are_named(tmp_path: Path) -> None:
 
 def test_unexpected_tensors_are_named(tmp_path: Path) -> None:
     tensors = seeded_tensors(SIFT) | {f"extractor.conv{n}.weight": torch.zeros(1) for n in range(7)}
-    expected = r"unexpected: extractor.conv0.weight, extractor.conv1.weight, .*, extractor.conv4.weight and 2 more$"
+    expected = f"unexpected: {', '.join(f'extractor.conv{n}.weight' for n in range(5))} and 2 more$"
     with pytest.raises(ConfigError, match=expected):
         load_lightglue(write(tmp_path / "weights.pth", tensors))
 

@@ -17,8 +17,8 @@ from aeromatch_cli.config import Settings, load, parse_method
 from aeromatch_cli.errors import ConfigError
 from benchmarks.tables import Row, plain
 
-# Of every judged pair, in what `evaluate` says of it.
-_FIGURES = ("possible", "kept", "correct", "median_error_px")
+# Of every judged pair, in what a truth or `evaluate` says of it.
+FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def judged_run(
     evaluated(work, images.parent, mapping=False)
     with (work / "evaluation" / "pairs.csv").open(encoding="utf-8", newline="") as stream:
         rows = {
-            (row["image0"], row["image1"]): {key: plain(float(row[key] or "nan")) for key in _FIGURES}
+            (row["image0"], row["image1"]): {key: plain(float(row[key] or "nan")) for key in FIGURES}
             for row in csv.DictReader(stream)
         }
     return rows, run.seconds

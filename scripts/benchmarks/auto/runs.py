@@ -18,12 +18,11 @@ from benchmarks.peers.worker import measure
 from benchmarks.scenes import NOISY_POSES, Judged, with_noisy_poses
 from benchmarks.sources import OUR_CODE, code_digest
 from benchmarks.tables import Row, plain
-from benchmarks.whole import judged_run
+from benchmarks.whole import FIGURES, judged_run
 
 JUDGED = "auto"
 # Of auto as it is: several settings of it, which run at a time, start from its one workspace.
 _making = RLock()
-_FIGURES = ("kept", "correct", "median_error_px")
 
 
 def rows_of(args: argparse.Namespace, block: Block, judged: Judged, method: str) -> list[Row]:
@@ -79,5 +78,5 @@ def _peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]
         score = judged.truth.judge(*pair.images, *answer).row()
         again = [s for image, s in zip(pair.images, measured.features_seconds, strict=True) if image in known]
         known.update(pair.images)
-        rows.append({**{key: plain(score[key]) for key in _FIGURES}, "seconds": measured.seconds - sum(again)})
+        rows.append({**{key: plain(score[key]) for key in FIGURES}, "seconds": measured.seconds - sum(again)})
     return rows

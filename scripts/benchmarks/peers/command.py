@@ -64,7 +64,7 @@ from benchmarks.tables import (
     table,
     write_rows,
 )
-from benchmarks.whole import judged_run
+from benchmarks.whole import FIGURES, judged_run
 
 THREADS = 2
 ENOUGH_CORRECT = 30
@@ -73,7 +73,6 @@ METHODS = (
     "SIFT=opencv-sift,pycolmap,pycolmap-guided,aliked@ground,"
     "aliked+lightglue,aliked+lightglue@ground,disk+lightglue@ground,xfeat+lighterglue@ground"
 )
-_FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 
 def asked_scenes(args: argparse.Namespace) -> Iterator[Judged]:
@@ -108,7 +107,7 @@ def _of_pairs(spec: str, judged: Judged, limits: Options, store: Path) -> Iterat
         found = measured.found
         answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
         score = judged.truth.judge(*pair.images, *answer).row()
-        yield {**{key: plain(score[key]) for key in _FIGURES}, "seconds": plain(measured.seconds)}
+        yield {**{key: plain(score[key]) for key in FIGURES}, "seconds": plain(measured.seconds)}
 
 
 def _of_run(spec: str, judged: Judged, limits: Options, store: Path) -> Iterator[Row]:
