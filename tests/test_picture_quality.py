@@ -160,8 +160,8 @@ def test_blurred_pictures_are_named_before_the_long_stages_and_left_out_where_as
     path = site.images / names[3]
     cv2.imwrite(str(path), cv2.GaussianBlur(cv2.imread(str(path)), (0, 0), 4.0))
     said = site("pairs", "--set", "orient=none")
-    named = rf"1 of {len(names)} images \({re.escape(names[3])}: 0\.\d\d\) is far more blurred than others of the same camera"
-    assert re.search(named, said.stderr)
+    named = rf"1 of {len(names)} images \({re.escape(names[3])}: 0\.\d\d\) is far more blurred than others of the same"
+    assert re.search(f"{named} camera: ", said.stderr)
     figures = read_picture_quality(site.work / "images.csv")
     assert len(figures) == len(names)
     assert max(figures, key=lambda key: figures[key].blur)[0].startswith(Path(names[3]).stem)
