@@ -173,7 +173,7 @@ def test_part_of_the_shards_is_said_to_be_a_part(site):
 def test_check_writes_nothing(site):
     outcome = site("check")
     assert outcome.code == 0
-    assert f"images    {IMAGES} of {IMAGES} readable" in outcome.stdout
+    assert f"images    {IMAGES} of {IMAGES} can be used" in outcome.stdout
     assert outcome.facts["estimate"]["pairs"] == PAIRS
     assert outcome.facts["estimate"]["memory_mb"] > 0
     assert not site.work.exists()
@@ -205,9 +205,9 @@ def test_quiet_leaves_errors_and_json(site):
     name, reason = site.names()[0], "file is empty: copy it again"
     first, *others = outcome.stderr.splitlines()
     assert first == f"{name}: {reason}"
-    lost = f"lost      1 of {IMAGES} images is not in the result (1 not read): {name}; listed in {site.work}/lost.csv"
+    lost = f"lost      1 of {IMAGES} images is not in the result (1 left out): {name}; listed in {site.work}/lost.csv"
     assert others[-2:] == [lost, f"1 failed, listed in {site.work}/failures.csv"]
-    assert (site.work / "lost.csv").read_text() == f"image,what,reason\n{name},not read,{reason}\n"
+    assert (site.work / "lost.csv").read_text() == f"image,what,reason\n{name},left out,{reason}\n"
     outcome = invoke("run", "baseline", *site.options("--quiet", "--json"))
     assert len(outcome.stdout.splitlines()) == 1
     outcome = invoke("run", "baseline", *site.options("--quiet", "--shard", "0/1"))

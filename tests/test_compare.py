@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import invoke
+from make_results import filled
 
 from aeromatch_cli.data import Image
 from aeromatch_cli.report import compare as compared
-from aeromatch_cli.report.compare import Standing, as_facts, criteria, verdict_lines
+from aeromatch_cli.report.compare import Judged, Standing, as_facts, criteria, verdict_lines
+from aeromatch_cli.results.stages import BlockResults
 
-SOUND = Standing("good", 12, 0.05, frozenset({"c1", "c2"}), 3, 50_000)
+SOUND = Standing("good", 12, 0.05, frozenset({"c1", "c2"}), 3, 50_000, Judged("A", 800, 0.04))
 
 
 @pytest.mark.parametrize(
@@ -29,6 +32,10 @@ SOUND = Standing("good", 12, 0.05, frozenset({"c1", "c2"}), 3, 50_000)
         ({"oriented": 10, "check_m": 0.01, "matches": 90_000}, "first", "images oriented, 12 in the first and 10"),
         ({"verdict": "doubtful", "oriented": 12, "check_m": 0.01}, "first", "result, good in the first and doubtful"),
         ({"verdict": None, "oriented": None, "matches": 60_000}, "second", "verified matches"),
+        # Truth outranks the verdict, but that of another block says nothing.
+        ({"verdict": "bad", "judged": Judged("A", 900, 0.02)}, "second", "`aeromatch evaluate`, 800 in the first and"),
+        ({"verdict": "bad", "judged": Judged("A", 801, 0.02)}, "second", "evaluate`, 4.0 % in the first and 2.0 % in"),
+        ({"verdict": "bad", "judged": Judged("B", 900, 0.02)}, "first", "result, good in the first and bad in"),
     ],
 )  # fmt: skip
 def test_the_gravest_difference_decides(changes: dict[str, object], better: str, words: str) -> None:
@@ -48,9 +55,10 @@ def test_what_speaks_the_other_way_is_said() -> None:
     ]
 
 
-def side(*names: str, width_px: int = 1000, time: str = "", matches: int = 100) -> compared._Side:
+def side(*names: str, width_px: int = 1000, time: str = "", matches: int = 100, **found: Any) -> compared._Side:
     images = {name: Image(name.replace(".", "_"), name, width_px, 750, "1", time=time) for name in names}
-    return compared._Side({}, images, {(names[0], names[1]): matches}, {}, None, None, frozenset(names), "good")
+    matched = {(names[0], names[1]): matches}
+    return compared._Side({}, images, matched, {}, filled(BlockResults, found), frozenset(names), "good")
 
 
 def outcome_of(monkeypatch: pytest.MonkeyPatch, first: compared._Side, second: compared._Side):
@@ -81,5 +89,20 @@ def test_of_blocks_that_share_most_images_these_are_compared(monkeypatch: pytest
     assert outcome.code == 0, outcome.stderr
     assert outcome.facts["better"] == "second"
     assert "only in the first: c.jpg" in outcome.stdout
+    assert "settings    the same" in outcome.stdout
     oriented = next(one for one in outcome.facts["criteria"] if one["what"] == "images oriented")
     assert (oriented["first"], oriented["second"], oriented["better"]) == ("2", "2", "neither")
+
+
+def test_what_is_compared_is_the_block_as_it_is_exported_and_what_was_left_out_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    adjusted = {"images": 3, "points": 800, "track_length": 3.0, "reprojection_error_px": 0.54}
+    final = {"points_left": 700, "observations_left": 2030, "reprojection_error_px": 0.43}
+    names = "a.jpg", "b.jpg", "c.jpg"
+    first = side(*names, adjust=adjusted, consistency=final, pairs={"left_out": ["the step learned"]})
+    outcome = outcome_of(monkeypatch, first, side(*names, adjust=adjusted))  # that of an earlier version
+    lines = outcome.stdout.splitlines()
+    assert "left out    in the first, to end in time (run --within): the step learned" in lines
+    assert "points      700 and 800 (+14.3 %)" in lines
+    assert "error px    0.43 and 0.54 (+25.6 %)" in lines

@@ -190,11 +190,15 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert 0 < facts["dropped_matches"] < before / 2
     assert facts["verified_matches"] == before - facts["dropped_matches"]
     assert stages["export"]["result"]["exporters"]["colmap"]["verified_matches"] == facts["verified_matches"]
-    assert f"{facts['dropped_matches']} matches contradict the adjusted block" in outcome.stdout
+    assert f"dropped {facts['dropped_matches']} matches that contradict the adjusted block" in outcome.stdout
     model = pycolmap.Reconstruction(done_site.work / "export" / "colmap" / "sparse")
     assert model.num_points3D() == facts["points_left"] <= facts["points"]
     assert model.compute_num_observations() == facts["observations_left"] < facts["observations"]
-    assert f"{facts['points_left']} of {facts['points']} points are left" in outcome.stdout
+    length = model.compute_mean_track_length()
+    error_px = model.compute_mean_reprojection_error()
+    assert facts["reprojection_error_px"] == pytest.approx(error_px, abs=1e-3)
+    words = f"in {length:.1f} images each, reprojection error {error_px:.2f} px"
+    assert f"{facts['points_left']} of {facts['points']} points are left, {words}" in outcome.stdout
     spread = facts["spread"].values()
     assert all(0 < ninths <= 9 and 0 < points < 1000 for ninths, _, points in spread)
     assert all(ninths + empty <= 9 for ninths, empty, _ in spread)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import IMAGES, UNORIENTED, Site, invoke
+from make_results import filled
 from PIL import Image
 
 from aeromatch_cli.config import load, preset_names
@@ -23,6 +24,8 @@ from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.show import _pose_lines
 from aeromatch_cli.report.tiles import aligned
+from aeromatch_cli.results.stages import OrientResult
+from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import Workspace
 
 SETTINGS = UNORIENTED
@@ -67,14 +70,18 @@ def test_poses_in_a_frame_of_their_own_have_no_origin_and_no_metres(tmp_path: Pa
     work: Any = SimpleNamespace(workspace=workspace, poses=poses, adjusted=adjusted)
     of_a, of_b = ([line for line in _pose_lines(work, i) if " x " in line] for i in "ab")
     assert of_a == [
-        "pose        x 306011.000, y 4545021.000, z 301.000 m, standard deviation 0.5 m",
+        "given       x 306011.000, y 4545021.000, z 301.000 m, standard deviation 0.5 m",
         "adjusted    x 306010.000, y 4545020.000, z 300.000 m, standard deviation 0.02 m",
     ]
     unit = "units of arbitrary length"
     assert of_b == [
-        f"pose        x 1.000, y -3.956, z 101.000 {unit} in frame own 2, standard deviation 0.5 {unit}",
+        f"given       x 1.000, y -3.956, z 101.000 {unit} in frame own 2, standard deviation 0.5 {unit}",
         f"adjusted    x 0.000, y -4.956, z 100.000 {unit} in frame own 1, standard deviation 0.02 {unit}",
     ]
+    # How exact a pose of the first pass is nobody has estimated.
+    found = filled(OrientResult, poses_from="pictures")
+    write_json(workspace.stage_report("orient"), StageReport("orient", result=found)._record().as_json())
+    assert next(_pose_lines(work, "a")) == "first pass  x 306011.000, y 4545021.000, z 301.000 m"
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ def test_images_are_lost_that_were_not_read_or_not_oriented(tmp_path: Path) -> N
     assert lost == [
         ("a6.jpg", "not oriented", "no texture"),
         ("a7.jpg", "not oriented", "no pair"),
-        ("b.jpg", "not read", "file is empty"),
+        ("b.jpg", "left out", "file is empty"),
     ]
     links = {"unread": ["a6_jpg"], "unconnected": ["a5_jpg"]}
     damaged = lost_images(filled(BlockResults, adjust=adjusted, filter=links), (), NAMES)
@@ -37,7 +37,7 @@ def test_images_are_lost_that_were_not_read_or_not_oriented(tmp_path: Path) -> N
     assert [(name, what) for name, what, _ in unadjusted] == [("a5.jpg", "not connected"), ("a6.jpg", "not read")]
     workspace = Workspace(tmp_path)
     assert lost_lines(workspace, lost, 9) == [
-        "lost      3 of 9 images are not in the result (2 not oriented, 1 not read): a6.jpg, a7.jpg, b.jpg; "
+        "lost      3 of 9 images are not in the result (1 left out, 2 not oriented): a6.jpg, a7.jpg, b.jpg; "
         f"listed in {tmp_path}/lost.csv"
     ]
     write_lost(workspace, lost)

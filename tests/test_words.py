@@ -75,11 +75,18 @@ def test_lines_of_one_match() -> None:
     assert line.endswith("; 1 verified match")
     dropped = ConsistencyResult(verified_matches=1, dropped_matches=1, points=3)
     (line, *_) = messages._consistency_lines(dropped, {})
-    assert line == "1 match contradicts the adjusted block; 1 verified match is left"
-    dropped = ConsistencyResult(verified_matches=20, dropped_matches=2, expected_right=0.98)
-    (line, *_) = messages._consistency_lines(dropped, {})
+    assert line == "dropped 1 match that contradicts the adjusted block; 1 verified match is left"
     left = "20 verified matches are left, of which 98.0 % are expected to be right to 3 px"
-    assert line == f"2 matches are not likely to be right; {left}"
+    for contradicting, words in (
+        (0, "dropped 2 matches that are not likely to be right"),
+        (1, "dropped 2 matches: 1 contradicts the adjusted block, 1 is not likely to be right"),
+        (2, "dropped 2 matches that contradict the adjusted block"),
+    ):
+        dropped = ConsistencyResult(
+            verified_matches=20, dropped_matches=2, contradicting_matches=contradicting, expected_right=0.98
+        )
+        (line, *_) = messages._consistency_lines(dropped, {})
+        assert line == f"{words}; {left}"
 
 
 def test_stages_of_the_page_count_one_thing() -> None:

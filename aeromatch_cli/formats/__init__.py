@@ -258,8 +258,9 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 ### lost.csv
 
 Written by `run` and `adjust`: every image of the folder that the result does not hold. `image` (relative path), `what`
-(`not read`, `not oriented`; of a block that was not adjusted `not connected`), `reason`. Without lines where
-every image is held.
+(`left out` of the block, such as a picture with a damaged header or one that no camera is known of; `not read`, where
+its pixels could not be; `not oriented`; of a block that was not adjusted `not connected`), `reason`. Without lines
+where every image is held.
 
 ### .lock
 

@@ -11,7 +11,7 @@ from aeromatch_cli.formats.adjusted import read_adjusted, read_residuals
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.results.adjustment import Control
-from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, OrientResult
+from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, OrientResult, with_final_points
 from aeromatch_cli.sfm.control import offset_words
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.context import Context
@@ -127,8 +127,8 @@ def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> li
 
 
 def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
-    """Figures of the bundle adjustment, and of the control points."""
-    adjusted = adjustment.found
+    """Figures of the adjusted block with its final points, and of the control points."""
+    adjusted = with_final_points(adjustment.found, adjustment.judged)
     if not adjusted.points:
         return []
     found = [

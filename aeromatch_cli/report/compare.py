@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,11 +14,10 @@ from aeromatch_cli.config import differing, load
 from aeromatch_cli.data import Image, Pair
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.tables import read_csv
-from aeromatch_cli.report.rows import seconds_by_stage
-from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult
-from aeromatch_cli.stages.quality import quality_on_file
+from aeromatch_cli.report.rows import present_evaluation, seconds_by_stage
+from aeromatch_cli.results.stages import AdjustResult, BlockResults
+from aeromatch_cli.stages.quality import quality_on_file, results_of
 from aeromatch_cli.stages.settings_diff import said_value
-from aeromatch_cli.stages.stage_report import result_on_file
 from aeromatch_cli.store.opened import OpenedBlock
 from aeromatch_cli.words import MANY, form, listed
 from aeromatch_cli.workspace import Workspace
@@ -32,13 +31,23 @@ _LEAST_COMMON = 0.5
 _UNORIENTED = "predicted"
 
 
+class Judged(NamedTuple):
+    """What `aeromatch evaluate` found of the present matches by the truth in a folder: how many are correct, and the
+    share that is wrong."""
+
+    truth: str
+    correct: float
+    wrong: float
+
+
 @dataclass(frozen=True)
 class Standing:
     """What speaks for one side; None where it is not known.
 
     verdict: as `aeromatch run` says it. oriented: images of those in both. check_m: error at check points, root mean
-    square of their distances, and checks: which these are. empty: ninths of images without a point though other images
-    show them. matches: verified ones of pairs of images in both.
+    square of their distances, and checks: which these are. empty: parts of images (3 x 3 each) without a point though
+    other images show them. matches: verified ones of pairs of images in both. judged: by truth, which outranks all
+    else.
     """
 
     verdict: str | None
@@ -47,6 +56,7 @@ class Standing:
     checks: frozenset[str]
     empty: int | None
     matches: int
+    judged: Judged | None = None
 
 
 @dataclass(frozen=True)
@@ -88,6 +98,11 @@ def _words(one: Criterion) -> str:
 
 
 def _criteria(one: Standing, two: Standing) -> Iterator[Criterion]:
+    if one.judged is not None and two.judged is not None and one.judged.truth == two.judged.truth:
+        correct, wrong = zip(one.judged[1:], two.judged[1:], strict=True)
+        yield _larger("correct matches by `aeromatch evaluate`", correct, None, _MATCHES_SHARE)
+        shown = f"{100 * wrong[0]:.1f} %", f"{100 * wrong[1]:.1f} %"
+        yield _larger("wrong matches by `aeromatch evaluate`", (-wrong[0], -wrong[1]), shown, _ERROR_SHARE)
     if one.verdict is not None and two.verdict is not None:
         order = ("bad", "doubtful", "good")
         yield _larger("result", (order.index(one.verdict), order.index(two.verdict)), (one.verdict, two.verdict))
@@ -108,7 +123,7 @@ def _larger(
     """share: of the larger magnitude, by which values may differ without being better."""
     first, second = values
     even = abs(first - second) <= share * max(abs(first), abs(second))
-    words = shown or (f"{first:,}", f"{second:,}")
+    words = shown or (f"{first:,.0f}", f"{second:,.0f}")
     if even:
         return Criterion(what, *words, "neither")
     return Criterion(what, *words, "first" if first > second else "second")
@@ -116,18 +131,23 @@ def _larger(
 
 @dataclass(frozen=True)
 class _Side:
-    """images: by name. matches: verified ones by pair of image names. seconds: by stage. adjusted, consistent: results
-    of these stages. oriented: names of images, None where nothing was adjusted. verdict: on the block, None where its
-    stages have not run."""
+    """images: by name. matches: verified ones by pair of image names. seconds: by stage. results: of the stages.
+    oriented: names of images, None where nothing was adjusted. verdict: on the block, None where its stages have not
+    run."""
 
     settings: Mapping[str, Any]
     images: Mapping[str, Image]
     matches: Mapping[tuple[str, str], int]
     seconds: Mapping[str, float]
-    adjusted: AdjustResult | None
-    consistent: ConsistencyResult | None
+    results: BlockResults
     oriented: frozenset[str] | None
     verdict: str | None
+    judged: Judged | None = None
+
+    @property
+    def left_out(self) -> list[str]:
+        """What `run --within` did without."""
+        return [] if self.results.pairs is None else self.results.pairs.left_out
 
 
 def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
@@ -143,9 +163,11 @@ def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
         if key.partition(".")[0] not in _OUTWARD
     ]
     lines += [f"setting     {words}" for words in changed] or ["settings    the same"]
+    for words, side in (("first", one), ("second", two)):
+        if side.left_out:
+            lines.append(f"left out    in the {words}, to end in time (run --within): {'; '.join(side.left_out)}")
     lines += [*_image_lines(one, two), *_match_lines(one, two)]
-    if one.adjusted is not None and two.adjusted is not None:
-        lines += _adjusted_lines(one.adjusted, two.adjusted)
+    lines += _block_lines(one.results.final_block, two.results.final_block)
     for stage in (stage for stage in graph.ORDER if stage in one.seconds and stage in two.seconds):
         lines.append(f"seconds     {stage}: {one.seconds[stage]:.1f} and {two.seconds[stage]:.1f}")
     common = one.images.keys() & two.images.keys()
@@ -215,9 +237,10 @@ def _verified(side: _Side) -> set[tuple[str, str]]:
 
 def _standing(side: _Side, common: Any) -> Standing:
     """common: names of the images in both."""
-    control = None if side.adjusted is None else side.adjusted.control
+    adjusted, consistent = side.results.adjust, side.results.consistency
+    control = None if adjusted is None else adjusted.control
     rmse_m = None if control is None else control.check_rmse_m
-    spread = {} if side.consistent is None else side.consistent.spread
+    spread = {} if consistent is None else consistent.spread
     names = {image.image_id: name for name, image in side.images.items()}
     return Standing(
         verdict=side.verdict,
@@ -226,10 +249,14 @@ def _standing(side: _Side, common: Any) -> Standing:
         checks=frozenset() if control is None else frozenset(control.checks),
         empty=sum(ninths.empty for i, ninths in spread.items() if names.get(i) in common) if spread else None,
         matches=sum(count for pair, count in side.matches.items() if common.issuperset(pair)),
+        judged=side.judged,
     )
 
 
-def _adjusted_lines(one: AdjustResult, two: AdjustResult) -> Iterator[str]:
+def _block_lines(one: AdjustResult | None, two: AdjustResult | None) -> Iterator[str]:
+    """Figures of both final blocks; nothing where one has none."""
+    if one is None or two is None:
+        return
     yield _counts("oriented", one.images, two.images)
     yield _counts("points", one.points, two.points)
     if one.reprojection_error_px is not None and two.reprojection_error_px is not None:
@@ -256,11 +283,19 @@ def _side(root: Path) -> _Side:
         images={image.name: image for image in block.images.values()},
         matches={(block.names[p.image_id0], block.names[p.image_id1]): _final_matches(block, p) for p in block.pairs},
         seconds=seconds_by_stage(workspace),
-        adjusted=result_on_file(workspace, AdjustResult),
-        consistent=result_on_file(workspace, ConsistencyResult),
+        results=results_of(workspace),
         oriented=_oriented(workspace),
         verdict=None if quality is None else quality.verdict,
+        judged=_judged(workspace),
     )
+
+
+def _judged(workspace: Workspace) -> Judged | None:
+    found = present_evaluation(workspace)
+    if found is None or found["totals"]["correctness"] is None:
+        return None
+    totals = found["totals"]
+    return Judged(found["truth"], totals["correct"], 1.0 - totals["correctness"])
 
 
 def _final_matches(block: OpenedBlock, pair: Pair) -> int:

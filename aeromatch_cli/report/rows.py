@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from aeromatch_cli import graph
 from aeromatch_cli.files import read_json, read_record
@@ -244,6 +245,12 @@ def evaluation_figures(workspace: Workspace) -> EvaluationFigures | None:
     for path in sorted(workspace.evaluation.glob("*.png")):
         coded = base64.b64encode(path.read_bytes()).decode("ascii")
         pictures.append((path.stem.replace("_", " "), f"data:image/png;base64,{coded}"))
-    outdated = workspace.ran_since(stated, "filter", "consistency")
     summary = [(str(name), str(value)) for name, value in read_json(stated)["summary"]]
-    return EvaluationFigures(summary, pictures, outdated)
+    return EvaluationFigures(summary, pictures, outdated=present_evaluation(workspace) is None)
+
+
+def present_evaluation(workspace: Workspace) -> dict[str, Any] | None:
+    """What evaluation.json holds; None where the workspace was not evaluated since its matches were made."""
+    stated = workspace.evaluation / "evaluation.json"
+    outdated = not stated.is_file() or workspace.ran_since(stated, "filter", "consistency")
+    return None if outdated else dict(read_json(stated))

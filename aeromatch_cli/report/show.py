@@ -232,14 +232,16 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
 
 
 def _pose_lines(work: _Work, image_id: str) -> Iterator[str]:
-    """Say the pose of an image as it is known, and as it was adjusted."""
+    """Say the pose of an image as it was given or as the first pass found it, and as it was adjusted."""
     world = read_json(work.workspace.block)
     origin_m = world["origin_m"]
     # Those of earlier versions do not say what frames are.
     frame = world.get("frames", {}).get(image_id, 0)
     metric = world.get("metric", True) and not frame
-    for words in _pose_words(work.poses.get(image_id), origin_m, frame, metric=metric):
-        yield f"pose        {words}"
+    orient = result_on_file(work.workspace, OrientResult)
+    found = orient is not None and orient.poses_from == "pictures"
+    for words in _pose_words(work.poses.get(image_id), origin_m, frame, metric=metric, rough=found):
+        yield f"{'first pass' if found else 'given':<11} {words}"
     if work.adjusted is None or image_id not in work.adjusted.poses:
         return
     adjusted = work.adjusted.poses[image_id]
@@ -291,8 +293,11 @@ def _own_file(workspace: Workspace, name: str) -> Path:
     return folder / name
 
 
-def _pose_words(pose: Pose | None, origin_m: Sequence[float], frame: int, *, metric: bool) -> Iterator[str]:
-    """frame: number of the frame of its own that the pose lies in, 0 in the world."""
+def _pose_words(
+    pose: Pose | None, origin_m: Sequence[float], frame: int, *, metric: bool, rough: bool = False
+) -> Iterator[str]:
+    """frame: number of the frame of its own that the pose lies in, 0 in the world. rough: how exact it is, nobody has
+    estimated."""
     if pose is None:
         yield "unknown"
         return
@@ -300,10 +305,10 @@ def _pose_words(pose: Pose | None, origin_m: Sequence[float], frame: int, *, met
     x, y, z = np.array(pose.center_m) + np.array(origin_m) * metric
     unit = "m" if metric else "units of arbitrary length"
     where = f" in frame own {frame}" if frame else ""
-    exact = f"standard deviation {pose.sigma_position_m:.3g} {unit}"
+    exact = "" if rough else f", standard deviation {pose.sigma_position_m:.3g} {unit}"
     if not metric and pose.sigma_position_m > LOCAL_FLYING_HEIGHT:
-        exact = "its distance is not determined by the matches"
-    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} {unit}{where}, {exact}"
+        exact = ", its distance is not determined by the matches"
+    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} {unit}{where}{exact}"
     if pose.world_rotation is not None:
         angles = ", ".join(f"{v:.4f}" for v in to_omega_phi_kappa(pose.world_rotation))
         yield f"omega, phi, kappa {angles} degrees, {tilt_deg(pose.world_rotation):.1f} from straight down"

@@ -9,6 +9,8 @@ from pydantic import Field
 from aeromatch_cli.results.adjustment import Control, GroupResult, PlacementKind, PoseResiduals
 from aeromatch_cli.results.record import Record
 
+# Images with fewer points that three images see are held by their neighbours one by one.
+FEW_POINTS = 20
 UNREAD = "Images whose pictures could not be read; the other lists, and the groups, are without them."
 
 
@@ -274,8 +276,25 @@ class ConsistencyResult(StageResult):
     points_left: int = Field(0, description="Those of them that the final matches hold.")
     observations: int = 0
     observations_left: int = 0
+    reprojection_error_px: float | None = Field(None, description="Mean of the points that are left, pixels.")
     spread: dict[str, Ninths] = Field({}, description="Image -> where it holds points.")
     remark: str = ""
+
+
+def with_final_points(adjust: AdjustResult, judged: ConsistencyResult | None) -> AdjustResult:
+    """An adjusted block with the figures of those points alone that final matches hold. judged: of this block; those of
+    earlier versions do not know the error, and change nothing."""
+    if judged is None or judged.reprojection_error_px is None:
+        return adjust
+    held_by_pairs = sum(ninths.points < FEW_POINTS for ninths in judged.spread.values())
+    return adjust.model_copy(
+        update={
+            "points": judged.points_left,
+            "track_length": round(judged.observations_left / max(1, judged.points_left), 3),
+            "reprojection_error_px": judged.reprojection_error_px,
+            "held_by_pairs": held_by_pairs,
+        }
+    )
 
 
 class Exported(Record):
@@ -320,6 +339,11 @@ class BlockResults(Record):
     refine: RefineResult | None = None
     adjust: AdjustResult | None = None
     consistency: ConsistencyResult | None = None
+
+    @property
+    def final_block(self) -> AdjustResult | None:
+        """The adjusted block with the points that the final matches hold: what is exported, and judged."""
+        return None if self.adjust is None else with_final_points(self.adjust, self.consistency)
 
     @property
     def connection(self) -> FilterResult | ConsistencyResult | None:

@@ -11,11 +11,8 @@ from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, IntArra
 from aeromatch_cli.geometry.cameras import corner_params, focal_px, project
 from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.results.adjustment import GroupResult, PoseResiduals, Worst
-from aeromatch_cli.results.stages import AdjustedCamera
+from aeromatch_cli.results.stages import FEW_POINTS, AdjustedCamera
 
-# Images with fewer points of three images and more are held by their neighbours one by one; pairs that share fewer tie
-# no parts.
-_FEW_POINTS = 20
 _UNKNOWN = np.full(3, np.nan)
 
 
@@ -28,9 +25,9 @@ def block_figures(adjusted: AdjustedBlock, images: Iterable[Image], groups: Sequ
         "images": len(adjusted.poses),
         "points": len(adjusted.points_m),
         "track_length": round(adjusted.observations / max(1, len(adjusted.points_m)), 3),
-        "held_by_pairs": sum(count < _FEW_POINTS for count in held),
+        "held_by_pairs": sum(count < FEW_POINTS for count in held),
         "tied_parts": tied_parts(adjusted),
-        "reprojection_error_px": round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None,
+        "reprojection_error_px": mean_error_px(adjusted),
         "ground_pixel_m": _ground_pixel_m(adjusted, {image.image_id: image.camera_id for image in images}),
         # No length is a metre in a frame of a group's own.
         "sigma_position_m": _median([float(np.mean(pose.sigmas_m)) for pose in placed]),
@@ -43,6 +40,11 @@ def block_figures(adjusted: AdjustedBlock, images: Iterable[Image], groups: Sequ
             for camera_id, camera in sorted(adjusted.cameras.items())
         },
     }
+
+
+def mean_error_px(adjusted: AdjustedBlock) -> float | None:
+    """Return the mean reprojection error of the points of a block, pixels; None without points."""
+    return round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None
 
 
 def images_per_point(adjusted: AdjustedBlock) -> IntArray:
@@ -65,7 +67,7 @@ def tied_parts(adjusted: AdjustedBlock) -> list[int]:
     seen = sparse.csr_matrix(
         (np.ones(ends[-1]), np.concatenate(tracks), ends), shape=(len(tracks), len(adjusted.points_m))
     )
-    part = component_labels(len(tracks), np.column_stack((seen @ seen.T >= _FEW_POINTS).nonzero()))
+    part = component_labels(len(tracks), np.column_stack((seen @ seen.T >= FEW_POINTS).nonzero()))
     return sorted(np.bincount(part).tolist(), reverse=True)
 
 

@@ -257,7 +257,7 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
         "the poses as they are given"
     )
     return (
-        f"images    {estimate['readable_images']} of {images} readable",
+        f"images    {estimate['readable_images']} of {images} can be used",
         f"pairs     {estimate['pairs']}",
         f"time      {needed} with {context.executor.jobs} jobs",
         *([orienting] if seconds is not None and orient_s else []),

@@ -85,10 +85,10 @@ def command_result(
     quality = quality_of(results, names) if command in JUDGED and not part else None
     lost, urgent = list[Lost](), list[str]()
     if quality is not None:
-        unread = [*first.failures, *block_of(reports).unread.items()]
-        lost = lost_images(results, unread, names)
+        left_out = [*first.failures, *block_of(reports).unread.items()]
+        lost = lost_images(results, left_out, names)
         write_lost(workspace, lost)
-        told_lost = lost_lines(workspace, lost, len(names) + len(unread))
+        told_lost = lost_lines(workspace, lost, len(names) + len(left_out))
         lines += [*closing_lines(quality, results, names), *told_lost]
         urgent = [*([] if quality.verdict == "good" else verdict_lines(quality)), *told_lost]
     if unjudged:

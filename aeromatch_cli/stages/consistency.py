@@ -17,6 +17,7 @@ from aeromatch_cli.formats.adjusted import Dropped, read_adjusted, write_adjuste
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
 from aeromatch_cli.results.stages import ConsistencyResult, FilterResult, Ninths
+from aeromatch_cli.sfm.block_figures import images_per_point, mean_error_px
 from aeromatch_cli.sfm.outlier_rejection import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.sfm.track_pruning import without_dropped
 from aeromatch_cli.sfm.two_view_poses import placed_alone
@@ -92,6 +93,7 @@ def run(context: Context) -> StageReport:
         points_left=len(block.points_m),
         observations=adjusted.observations,
         observations_left=block.observations,
+        reprojection_error_px=mean_error_px(block),
         spread=_spread(context, block),
     )
     report.done = report.items
@@ -164,9 +166,7 @@ def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, Ninths]:
     another image of its pairs shows them, and its points that three or more images see: a block adjustment wants points
     everywhere, and in many images."""
     shown, places_px = _shown_ninths(context), contents_of(context).keypoints_px
-    seen = np.zeros(len(adjusted.points_m), dtype=np.int64)
-    for track in adjusted.tracks.values():
-        seen[np.unique(track[:, 1])] += 1
+    seen = images_per_point(adjusted)
     found = {}
     for image_id, track in sorted(adjusted.tracks.items()):
         image = context.image_by_id[image_id]

@@ -12,17 +12,17 @@ from aeromatch_cli.words import form, listed
 from aeromatch_cli.workspace import Workspace
 
 # What becomes of an image that is lost; also the column `what` of lost.csv.
-_FAILED, _UNORIENTED, _UNCONNECTED = "not read", "not oriented", "not connected"
+_LEFT_OUT, _FAILED, _UNORIENTED, _UNCONNECTED = "left out", "not read", "not oriented", "not connected"
 
 Lost = tuple[str, str, str]
 
 
-def lost_images(results: BlockResults, unread: Sequence[tuple[str, str]], names: Mapping[str, str]) -> list[Lost]:
+def lost_images(results: BlockResults, left_out: Sequence[tuple[str, str]], names: Mapping[str, str]) -> list[Lost]:
     """Name, what became of it, and the reason, of every image that the result does not hold.
 
-    unread: images that are not part of the block, with the reason. names: of the files, by image_id.
+    left_out: images that are not part of the block, with the reason. names: of the files, by image_id.
     """
-    lost = [(name, _FAILED, reason) for name, reason in unread]
+    lost = [(name, _LEFT_OUT, reason) for name, reason in left_out]
     links = results.connection
     failed = [] if links is None else links.unread
     if results.adjust is not None and (results.adjust.images or results.adjust.outside):

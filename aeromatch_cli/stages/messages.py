@@ -212,37 +212,51 @@ def _consistency_lines(found: ConsistencyResult, names: Mapping[str, str]) -> li
     doubtful = listed([names[i] for i in found.doubtful])
     lines = [f"too many matches contradict the adjusted poses of {doubtful}"] if doubtful else []
     if found.spread:
-        lines.append(_spread_words(found))
+        lines += _final_lines(found)
     if found.remark:
         lines.append(found.remark)
     if not found.dropped_matches and not found.rejected_pairs:
         return lines
-    rejected, expected = found.rejected_pairs, found.expected_right
-    dropped, left = found.dropped_matches, found.verified_matches or 0
+    rejected, expected, left = found.rejected_pairs, found.expected_right, found.verified_matches or 0
     pairs = f", all of {rejected} {form(rejected, 'pair')} among them" if rejected else ""
-    why = []
-    if found.points or expected is None:
-        why.append(f"{form(dropped, 'contradicts', 'contradict')} the adjusted block")
-    if expected is not None:
-        why.append(f"{form(dropped, 'is', 'are')} not likely to be right")
     right = "" if expected is None else f", of which {100 * expected:.1f} % are expected to be right to 3 px"
-    words = f"{_matches(dropped)} {' or '.join(why)}{pairs}"
+    words = f"{_dropped_words(found)}{pairs}"
     return [f"{words}; {_matches(left, 'verified ')} {form(left, 'is', 'are')} left{right}", *lines]
+
+
+def _dropped_words(found: ConsistencyResult) -> str:
+    """Say how many matches were dropped, and why."""
+    dropped = found.dropped_matches
+    # Those of earlier versions do not know the share of the one and of the other.
+    contradicting = dropped if found.contradicting_matches is None else found.contradicting_matches
+    unlikely = dropped - contradicting
+    contradict = form(contradicting, "contradicts", "contradict")
+    likely = f"{form(unlikely, 'is', 'are')} not likely to be right"
+    if not unlikely:
+        return f"dropped {_matches(dropped)} that {contradict} the adjusted block"
+    if not contradicting:
+        return f"dropped {_matches(dropped)} that {likely}"
+    return f"dropped {_matches(dropped)}: {contradicting} {contradict} the adjusted block, {unlikely} {likely}"
 
 
 def _matches(count: int, kind: str = "") -> str:
     return f"{count} {kind}{form(count, 'match', 'matches')}"
 
 
-def _spread_words(found: ConsistencyResult) -> str:
+def _final_lines(found: ConsistencyResult) -> Iterator[str]:
+    """Say how many points final matches hold, and how evenly the images have them."""
+    if found.points_left:
+        length, error_px = found.observations_left / found.points_left, found.reprojection_error_px
+        error = "" if error_px is None else f", reprojection error {error_px:.2f} px"
+        yield f"{found.points_left} of {found.points} points are left, in {length:.1f} images each{error}"
     spread = found.spread.values()
-    held, empty = sum(ninths.held for ninths in spread), sum(ninths.empty for ninths in spread)
-    many = sorted(ninths.points for ninths in spread)[len(spread) // 2]
-    lacking = f", none in {empty} that other images show" if empty else ""
-    left = f"{found.points_left} of {found.points} points are left, " if found.points_left else ""
-    return (
-        f"{left}in {held} ninths of the images (3 x 3 each){lacking}; "
-        f"{many} points per image are seen by three or more (median)"
+    held, empty = sum(parts.held for parts in spread), sum(parts.empty for parts in spread)
+    many = sorted(parts.points for parts in spread)[len(spread) // 2]
+    have = form(empty, "has", "have")
+    lacking = f", and {empty} {have} none though other images show the same ground" if empty else ""
+    yield (
+        f"{held} of {9 * len(spread)} parts of images (3 x 3 each) have points{lacking}; "
+        f"an image has {many} points that three or more images see (median)"
     )
 
 

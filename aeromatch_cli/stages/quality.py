@@ -18,7 +18,7 @@ _MEASURED = 0.5
 
 def quality_of(results: BlockResults, names: Mapping[str, str]) -> Quality | None:
     """Judge the block; None where the stages that tell have not run. names: of the files, by image_id."""
-    adjust, links, refined = results.adjust, results.connection, results.refine
+    adjust, links, refined = results.final_block, results.connection, results.refine
     if results.filter is None or adjust is None or links is None:
         return None
     consistency, unread = results.consistency, links.unread

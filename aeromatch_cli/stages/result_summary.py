@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from aeromatch_cli.results.stages import BlockResults
+from aeromatch_cli.results.stages import FEW_POINTS, BlockResults
 from aeromatch_cli.sfm.quality.finding import Quality
 from aeromatch_cli.stages.filter import WEAK_MATCHES
 from aeromatch_cli.words import listed, of_images
-
-# Images with fewer points that three images see hold a block adjustment loosely.
-_FEW_POINTS = 20
 
 
 def closing_lines(quality: Quality, results: BlockResults, names: Mapping[str, str]) -> list[str]:
@@ -37,10 +34,10 @@ def _weak(results: BlockResults, names: Mapping[str, str]) -> list[str]:
     if tied:
         lines.append(f"weak: {listed(names.get(i, i) for i in tied)}, with fewer than {WEAK_MATCHES} verified matches")
     spread = {} if results.consistency is None else results.consistency.spread
-    loose = [i for i, ninths in spread.items() if ninths.points < _FEW_POINTS and i not in tied]
+    loose = [i for i, ninths in spread.items() if ninths.points < FEW_POINTS and i not in tied]
     if loose and len(spread) > 2:
         named = listed(names.get(i, i) for i in loose)
-        lines.append(f"weak: {named}, with fewer than {_FEW_POINTS} points that three images see")
+        lines.append(f"weak: {named}, with fewer than {FEW_POINTS} points that three images see")
     empty = [i for i, ninths in spread.items() if ninths.empty]
     if empty:
         lines.append(
