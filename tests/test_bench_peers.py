@@ -154,7 +154,7 @@ def test_published_matchers_take_their_weights_by_either_name_and_places_as_they
 
     made.network = network
     given: list[Any] = []
-    monkeypatch.setattr(published, "magsac", lambda *sides: given.extend(sides[2:]) or np.zeros(0, np.int64))
+    monkeypatch.setattr(published, "verified", lambda *sides: given.extend(sides[3:5]) or np.zeros(0, np.int64))
     made.scene = replace(scene, cameras={"a": None, "b": None})
     made.match("a", "b", made.features("a"), made.features("b"))
     places = _Stub(scene, options).places

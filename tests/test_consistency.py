@@ -51,7 +51,12 @@ def held_together(truth: Truth, groups: list[set[str]]) -> AdjustedBlock:
 def judged(truth: Truth, keypoints: dict[str, FloatArray], pairs: list[MatchedKeypoints]) -> list[FloatArray]:
     block = held_together(truth, [set(truth.block.poses)])
     found = contradicting(block, cameras(truth), keypoints.__getitem__, pairs, LIMITS)
-    assert (found.doubtful, found.expected_right) == ([], None)
+    assert found.doubtful == []
+    # The share that is expected to be right is known also where nothing is dropped for want of probability.
+    asked = contradicting(block, cameras(truth), keypoints.__getitem__, pairs, replace(LIMITS, min_probability=1e-9))
+    assert found.expected_right == asked.expected_right
+    assert found.expected_right is not None
+    assert 0.5 < found.expected_right <= 1.0
     return found.masks
 
 

@@ -71,9 +71,9 @@ class Contradictions:
     """Holds what contradicts the block.
 
     masks: of every pair, which matches (M,) do, or are not likely to be right. by_distance: number of those that do.
-    doubtful: image ids whose adjusted poses too many of their matches
-    contradict: there the block is wrong, and none of their matches counts as contradicting. expected_right: the share
-    of the matches left that is right to 3 pixels, by their probabilities; None where these were not asked for.
+    doubtful: image ids whose adjusted poses too many of their matches contradict: there the block is wrong, and none of
+    their matches counts as contradicting. expected_right: the share
+    of the matches left that is right to 3 pixels, by their probabilities; None where the block judges none.
     """
 
     masks: list[BoolArray]
@@ -111,25 +111,26 @@ def contradicting(
     """
     settled = Settled.of(block, cameras, keypoints_px, pairs, limits)
     masks: list[BoolArray | None] = settled.masks
-    left: list[FloatArray] = [np.zeros(0)]
     if limits.by_probability:
         masks, known = settled.with_lone_pairs(cameras, keypoints_px, limits)
+    else:
+        known = settled.evidence()
     found = [
         np.zeros(len(pair.indices), dtype=bool) if mask is None else mask.copy()
         for pair, mask in zip(pairs, masks, strict=True)
     ]
     by_distance = sum(int(mask.sum()) for mask in found)
+    usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
+    likely = [None if evidence is None else probabilities(evidence, usual_px) for evidence in known]
     if limits.by_probability:
-        usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
-        likely = [None if evidence is None else probabilities(evidence, usual_px) for evidence in known]
         ends = [(pair.image_id0, pair.image_id1) for pair in pairs]
         least = least_probability(likely, limits.min_probability, limits.min_expected_right, limits.raised_up_to)
         stays = probable_enough(ends, likely, least, limits.min_matches)
-        for mask, p, keep in zip(found, likely, stays, strict=True):
+        for n, (mask, p, keep) in enumerate(zip(found, likely, stays, strict=True)):
             if p is not None and keep is not None:
                 mask[~mask] = ~keep
-                left.append(p[keep])
-    judged = np.concatenate(left)
+                likely[n] = p[keep]
+    judged = np.concatenate([np.zeros(0), *(p for p in likely if p is not None)])
     expected_right = float(judged.mean()) if len(judged) else None
     return Contradictions(found, by_distance, sorted(settled.doubtful), expected_right)
 

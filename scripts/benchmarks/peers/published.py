@@ -27,7 +27,7 @@ from benchmarks.peers.base import (
     size_of,
     strongest,
 )
-from benchmarks.peers.matching import Peer, magsac
+from benchmarks.peers.matching import Peer, verified
 
 _LIGHTGLUE: Mapping[str, Any] = {"input_dim": 128}
 _LIGHTERGLUE: Mapping[str, Any] = {
@@ -94,7 +94,7 @@ class XFeat(Peer):
 
 
 class WithLightGlue:
-    """Features of a peer, matched by a published LightGlue; MAGSAC++ as for all peers.
+    """Features of a peer, matched by a published LightGlue; verified as all peers are.
 
     Places are given to the network as the features' picture has them, which on ground views is not the stored image.
     """
@@ -110,7 +110,7 @@ class WithLightGlue:
     ) -> None:
         from kornia.feature import LightGlue
 
-        self.scene, self.peer = scene, features(scene, options)
+        self.scene, self.options, self.peer = scene, options, features(scene, options)
         self.network: Any = LightGlue(features=None, **settings)
         tensors = _renamed(read_weights(options, weights), self.network.conf.n_layers)
         own = self.network.state_dict()
@@ -140,7 +140,7 @@ class WithLightGlue:
 
     def match(self, image0: str, image1: str, features0: Described, features1: Described) -> Found:
         points0, points1, scores = self.candidates(image0, image1, features0, features1)
-        kept = magsac(self.scene.cameras[image0], self.scene.cameras[image1], points0, points1)
+        kept = verified(self.scene, image0, image1, points0, points1, self.options.seed)
         return found(features0, features1, points0[kept], points1[kept], scores[kept])
 
 
