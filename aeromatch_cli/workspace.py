@@ -277,6 +277,11 @@ def opened_workspace(root: Path, *, tables: bool = True) -> Workspace:
     """
     workspace = Workspace(root)
     if not workspace.images.is_file():
+        if not root.exists():
+            raise InputError(
+                f"the workspace {root} does not exist: check its path, and give the folder that an earlier `aeromatch "
+                "run --workspace DIR` has filled"
+            )
         if workspace.orientation.is_dir():
             state = "holds no results yet (images.csv is missing): its run is estimating the orientation, or was ended"
             raise InputError(f"{root} {state} while it did; `aeromatch run` goes on with it")

@@ -87,3 +87,6 @@ def test_a_folder_without_results_is_none(tmp_path: Path) -> None:
     outcome = invoke("check", "--deep", str(tmp_path))
     assert outcome.code == 3
     assert "is no workspace of aeromatch" in outcome.stderr
+    absent = invoke("check", "--deep", str(tmp_path / "absent"))
+    assert absent.code == 3
+    assert f"the workspace {tmp_path / 'absent'} does not exist: check its path" in absent.stderr

@@ -185,6 +185,14 @@ def test_a_folder_that_is_no_workspace(tmp_path: Path) -> None:
         outcome = invoke(*command)
         assert outcome.code == 3
         assert "is no workspace of aeromatch (images.csv is missing)" in outcome.stderr
+    absent = tmp_path / "absent"
+    for command in (("show", absent), ("show", absent, "a.jpg"), ("compare", absent, tmp_path)):
+        outcome = invoke(*command)
+        words = (
+            f"the workspace {absent} does not exist: check its path, and give the folder that an earlier `aeromatch "
+            "run --workspace DIR` has filled"
+        )
+        assert (outcome.code, words in outcome.stderr) == (3, True), outcome.stderr
     (tmp_path / "orientation").mkdir()  # what is there while the orientation is estimated
     outcome = invoke("show", tmp_path)
     assert (outcome.code, "its run is estimating the orientation" in outcome.stderr) == (3, True)
