@@ -28,7 +28,8 @@ def test_files_that_are_there_twice_are_found_by_their_contents(tmp_path: Path) 
     found = doubles({name: tmp_path / name for name in names})
     assert found == {"d.jpg": "a.jpg", "sub/b (1).jpg": "b.jpg"}
     assert remarks_on(found, range(5)) == [
-        "2 of 5 images (d.jpg is a.jpg, sub/b (1).jpg is b.jpg) are there twice: remove one of each"
+        "2 of 5 images have the same contents as others (d.jpg is a copy of a.jpg, sub/b (1).jpg is a copy of b.jpg): "
+        "the copies are left out and can be deleted"
     ]
     assert remarks_on({}, range(5)) == []
 

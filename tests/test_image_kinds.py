@@ -58,13 +58,29 @@ def test_unicode_and_blanks_in_names(site):
 def test_the_same_picture_twice(site):
     site = oriented(site)
     shutil.copy(site.image(0), site.images / "copy.jpg")
+    first = next(name for name in site.names() if name != "copy.jpg")
     site.rewrite_poses(lambda rows: [*rows, {**rows[0], "image": "copy.jpg"}])
     outcome = site("run")
     assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["result"]["components"] == [IMAGES + 1]
-    first = next(name for name in site.names() if name != "copy.jpg")
+    assert outcome.facts["stages"]["filter"]["result"]["components"] == [IMAGES]
     later, earlier = sorted(("copy.jpg", first), reverse=True)
-    assert f"1 of {IMAGES + 1} images ({later} is {earlier}) is there twice" in outcome.stderr
+    assert (
+        f"warning: 1 of {IMAGES + 1} images has the same contents as another ({later} is a copy of {earlier}): the "
+        "copy is left out and can be deleted"
+    ) in outcome.stderr
+    assert outcome.facts["lost"] == {later: f"a copy of {earlier}"}
+    assert (site.work / "lost.csv").read_text().splitlines() == [
+        "image,what,reason",
+        f"{later},not read,a copy of {earlier}",
+    ]
+
+
+def test_of_two_copies_the_one_with_a_pose_is_kept(site):
+    """A pose file may name only one of them."""
+    shutil.copy(site.image(0), site.images / "a copy.jpg")
+    named = sorted(name for name in site.names() if name != "a copy.jpg")[0]
+    outcome = site("pairs")
+    assert f"(a copy.jpg is a copy of {named})" in outcome.stderr
 
 
 def test_sizes_depths_and_formats_mixed(site):

@@ -13,8 +13,11 @@ from make_results import filled
 
 from aeromatch_cli.data import Pair
 from aeromatch_cli.report.rows import _details
+from aeromatch_cli.report.show import _Partner
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, FilterResult
 from aeromatch_cli.stages import messages, unregistered
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.strategies.filters.gate import shortage
 from aeromatch_cli.words import MANY, form, listed, of_images
 
 
@@ -87,6 +90,14 @@ def test_lines_of_one_match() -> None:
         )
         (line, *_) = messages._consistency_lines(dropped, {})
         assert line == f"{words}; {left}"
+
+
+def test_a_stage_of_one_item_and_a_pair_of_one_match() -> None:
+    (line,) = messages.stage_lines(StageReport("export", items=1, done=1, seconds=0.5), {}, part=False)
+    assert line == "export            1 item, 1 done, 0 up to date, 0 failed, 0.5 s"
+    assert shortage(1, 1, 15) == "1 inlier of 1 match, 15 needed"
+    assert shortage(3, 40, 15) == "3 inliers of 40 matches, 15 needed"
+    assert _Partner("a.jpg", 1, "verified", 0.5).words == "a.jpg: 1 match, verified, overlap 50 %"
 
 
 def test_stages_of_the_page_count_one_thing() -> None:

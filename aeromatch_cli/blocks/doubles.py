@@ -44,11 +44,13 @@ def doubles(files: Mapping[str, Path]) -> dict[str, str]:
 
 
 def remarks_on(found: Mapping[str, str], of_all: Sized) -> list[str]:
-    """One sentence about all of them."""
+    """One sentence about all of them. found: as `doubles` returns it. of_all: the images, with the copies."""
     if not found:
         return []
-    pairs = [f"{name} is {first}" for name, first in found.items()]
-    return [f"{of_images(pairs, of_all, 'is', 'are')} there twice: remove one of each"]
+    pairs = [f"{name} is a copy of {first}" for name, first in found.items()]
+    what = f"{form(len(pairs), 'has', 'have')} the same contents as {form(len(pairs), 'another', 'others')}"
+    done = form(len(pairs), "the copy is left out and can be deleted", "the copies are left out and can be deleted")
+    return [f"{len(pairs)} of {len(of_all)} images {what} ({listed(pairs)}): {done}"]
 
 
 def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:

@@ -31,7 +31,7 @@ from aeromatch_cli.blocks.crs import (
     checked_heights,
     heights_of,
 )
-from aeromatch_cli.blocks.doubles import in_two_formats, thumbnails
+from aeromatch_cli.blocks.doubles import in_two_formats, remarks_on, thumbnails
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.exif_and_xmp import settled, with_conventions
 from aeromatch_cli.blocks.image_names import matched_rows
@@ -54,7 +54,7 @@ from aeromatch_cli.blocks.sorties import captures_of, flights, velocities
 from aeromatch_cli.data import Camera, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.words import listed, of_images
+from aeromatch_cli.words import form, listed, of_images
 
 EXIF = "exif"
 FOLDER = "folder"
@@ -76,7 +76,7 @@ class BlockInputs:
     the ground as the input states it, or None; ground_hint_source: where it came from, in words, "" for None;
     ground_is_stated: the user's camera file says so, rather than a barometer. focal_sigmas: camera id -> standard
     deviation of its focal length, as a share of it. warnings: for a person, in order of reading. unread: pictures of
-    kinds that are not read, and panoramas.
+    kinds that are not read, panoramas, and copies of others.
     recognised: what the pose file was read as, and how many images it has, "" without one. flights, velocities: as in
     `sorties`. heights: what those of the world count from, as of `crs.heights_of`, "" where nothing states it.
     """
@@ -161,6 +161,7 @@ def block_inputs(
     exclude: str = "",
     drop_ground_shots: bool = False,
     given_heights: GivenHeights = _AS_STATED,
+    copies: Mapping[str, str] | None = None,
 ) -> BlockInputs:
     """Everything that is known of a block, except its ground.
 
@@ -169,10 +170,11 @@ def block_inputs(
     in metres (`crs.world_crs`), "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run
     in the same workspace, kept so that a growing block does not move. exclude: as of `left_out.excluded`.
     drop_ground_shots: leave out pictures that were taken on the ground. given_heights: of positions.
+    copies: images that are left out, since their files have the same contents as those of others: name -> the other.
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
-    chosen = _chosen_images(headers, passed_over, exclude, drop_ground_shots=drop_ground_shots)
+    chosen = _chosen_images(headers, passed_over, exclude, copies or {}, drop_ground_shots=drop_ground_shots)
     facts, warnings, failures = chosen.facts, [*chosen.warnings], [*chosen.failures]
     rows, remarks = _rows_of_images(lists, list(headers), facts)
     warnings += remarks
@@ -234,11 +236,12 @@ def _chosen_images(
     headers: Mapping[str, ExifFacts | str],
     passed_over: Sequence[ScanFailure],
     exclude: str,
+    copies: Mapping[str, str],
     *,
     drop_ground_shots: bool,
 ) -> _ChosenImages:
-    """Return the images that the user does not leave out and whose headers are usable, without panoramas and, where
-    asked for, without pictures that were taken on the ground."""
+    """Return the images that the user does not leave out and whose headers are usable, without panoramas, copies of
+    others and, where asked for, without pictures that were taken on the ground."""
     out, remarks = excluded(exclude, [*headers, *(one.name for one in passed_over if one.unread)])
     passed_over = [one for one in passed_over if one.name not in out]
     unread = tuple(ReadFailure(one.name, one.reason) for one in passed_over if one.unread)
@@ -259,7 +262,10 @@ def _chosen_images(
     warnings += remarks_on_ground_shots(shots, facts, dropped=drop_ground_shots)
     if drop_ground_shots:
         facts = {name: fact for name, fact in facts.items() if name not in shots}
-    return _ChosenImages(facts, unread + panoramas, failures, warnings)
+    warnings += remarks_on(copies, facts)
+    facts = {name: fact for name, fact in facts.items() if name not in copies}
+    doubled = tuple(ReadFailure(name, f"a copy of {first}") for name, first in copies.items())
+    return _ChosenImages(facts, unread + panoramas + doubled, failures, warnings)
 
 
 def _rows_of_images(
@@ -371,7 +377,9 @@ def _report_scan(scan_failures: Sequence[ScanFailure]) -> tuple[list[str], list[
 def _nothing_left(images_dir: str, failures: list[ReadFailure], passed_over: list[str]) -> str:
     if not failures:
         return "; ".join([f"no image ({KINDS}) in {images_dir}: check --images", *passed_over])
-    return f"none of the {len(failures)} images in {images_dir} can be used; {failures[0].name}: {failures[0].reason}"
+    many = f"none of the {len(failures)} images in {images_dir} can be used"
+    words = form(len(failures), f"the only image in {images_dir} cannot be used", many)
+    return f"{words}; {failures[0].name}: {failures[0].reason}"
 
 
 def _assign_cameras(lists: GivenLists, facts: Mapping[str, ExifFacts], columns: Mapping[str, str]) -> CameraAssignment:
@@ -566,5 +574,5 @@ def _relative_ground(poses: Mapping[str, Pose], facts: Mapping[str, ExifFacts]) 
         if name in poses and (relative_m := fact.relative_altitude_m) is not None
     ]
     if heights_m:
-        return float(np.median(heights_m)), f"XMP relative altitude of {len(heights_m)} images"
+        return float(np.median(heights_m)), f"XMP relative altitude of {len(heights_m)} {form(len(heights_m), 'image')}"
     return None, ""

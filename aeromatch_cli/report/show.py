@@ -157,16 +157,17 @@ def _stage_lines(workspace: Workspace) -> Iterator[str]:
         found = read_record(path, StageRecord)
         if found is None:
             continue
-        yield f"{stage:<11} {found.items} items, {found.failed} failed, {seconds[stage]:.1f} s"
+        yield f"{stage:<11} {found.items} {form(found.items, 'item')}, {found.failed} failed, {seconds[stage]:.1f} s"
         match result_of(found):
             case FilterResult() as judged:
                 states = ", ".join(f"{count} {state}" for state, count in judged.pairs.items())
-                yield f"            {states}; {judged.verified_matches} verified matches"
+                matches = judged.verified_matches
+                yield f"            {states}; {matches} verified {form(matches, 'match', 'matches')}"
             case ConsistencyResult(verified_matches=int(left)) as final:
                 when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
                 pairs = form(final.rejected_pairs, "pair")
                 dropped = f"{final.dropped_matches} of them dropped, {final.rejected_pairs} {pairs} rejected"
-                yield f"            {dropped}; {left} are left{when}"
+                yield f"            {dropped}; {left} {form(left, 'is', 'are')} left{when}"
 
 
 def _export_lines(workspace: Workspace) -> Iterator[str]:
@@ -263,7 +264,7 @@ class _Partner(NamedTuple):
     @property
     def words(self) -> str:
         share = "overlap unknown" if np.isnan(self.overlap) else f"overlap {100 * self.overlap:.0f} %"
-        return f"{self.name}: {self.matches} matches, {self.state}, {share}"
+        return f"{self.name}: {self.matches} {form(self.matches, 'match', 'matches')}, {self.state}, {share}"
 
 
 def _partners(work: _Work, image_id: str, keypoints: int) -> tuple[list[_Partner], BoolArray]:

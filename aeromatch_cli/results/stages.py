@@ -113,7 +113,7 @@ class PairsResult(StageResult):
     block: BlockFigures
     warnings: list[str] = Field(description="What a person should look at.")
     urgent: list[str] = Field([], description="Those of the warnings that --quiet does not hide.")
-    unread: dict[str, str] = Field({}, description="Picture of a kind that is not read -> reason.")
+    unread: dict[str, str] = Field({}, description="Picture of a kind that is not read, or a copy -> reason.")
     left_out: list[str] = Field([], description="What `run --within` did without, so that it ended in time.")
 
 

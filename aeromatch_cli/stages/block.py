@@ -12,6 +12,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from pydantic import TypeAdapter
 
 from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, world_crs
-from aeromatch_cli.blocks.doubles import doubles, remarks_on
+from aeromatch_cli.blocks.doubles import doubles
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.other_files import MASK
@@ -212,7 +213,8 @@ def _read_inputs(
             raise WorkspaceError(f"the header of {name} could not be read: {outcome.error}; run the same command again")
     # The origin of an earlier run is kept, unless the user now asks for another CRS.
     frame = WorldFrame(before["given_crs"], tuple(before["given_origin_m"])) if "given_crs" in before else None
-    inputs = block_inputs(
+    read = partial(
+        block_inputs,
         given.images,
         lists,
         {name: outcome.value[0] if outcome.value else outcome.error for name, outcome in outcomes.items()},
@@ -225,8 +227,11 @@ def _read_inputs(
         drop_ground_shots=given.ground_shots == "drop",
         given_heights=GivenHeights(given.heights, given.height_shift_m),
     )
-    twice = doubles({image.name: on_disk(remote.get(image.name) or root / image.name) for image in inputs.images})
-    inputs = replace(inputs, warnings=(*inputs.warnings, *remarks_on(twice, inputs.images)))
+    inputs = read()
+    # Of copies the one that has a pose is kept: a pose file may name only one of them.
+    posed_first = sorted(inputs.images, key=lambda image: image.image_id not in inputs.poses)
+    if copies := doubles({one.name: on_disk(remote.get(one.name) or root / one.name) for one in posed_first}):
+        inputs = read(copies=copies)
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
     found = {image.image_id: prints[image.name] for image in inputs.images}
     places = {image.image_id: remote.get(image.name) or root / image.name for image in inputs.images}

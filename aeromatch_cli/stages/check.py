@@ -33,6 +33,7 @@ from aeromatch_cli.stages.timing import (
     try_image,
 )
 from aeromatch_cli.strategies.orienters import FirstPass
+from aeromatch_cli.words import form
 
 # Of what the stages write, measured on blocks of 8 and 9 images of 0.75 megapixels. A match is written before and after
 # verification, and with a cascade once more by its step.
@@ -252,6 +253,7 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
     needed = "unknown (the sample could not be read)" if seconds is None else f"about {duration(seconds)}"
     further_s, names = estimate["seconds_of_further_steps"], " and ".join(s.name for s in context.settings.cascade)
     orient_s = estimate["seconds_to_orient"] or 0.0
+    workers = f"{context.executor.jobs} {form(context.executor.jobs, 'job')}"
     orienting = (
         f"orient    about {duration(orient_s)} of that, more where the first pass is poor; pairs above are those of "
         "the poses as they are given"
@@ -259,9 +261,9 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
     return (
         f"images    {estimate['readable_images']} of {images} can be used",
         f"pairs     {estimate['pairs']}",
-        f"time      {needed} with {context.executor.jobs} jobs",
+        f"time      {needed} with {workers}",
         *([orienting] if seconds is not None and orient_s else []),
         *([f"further   {names}: up to {duration(further_s)} more, where all pairs need it"] if further_s else []),
-        f"memory    about {estimate['memory_mb']} MB with {context.executor.jobs} jobs",
+        f"memory    about {estimate['memory_mb']} MB with {workers}",
         f"disk      about {estimate['disk_mb']} MB needed, {estimate['disk_free_mb']} MB free",
     )

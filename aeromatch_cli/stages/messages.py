@@ -32,8 +32,8 @@ def stage_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> 
     if isinstance(stage.result, RefineResult) and not stage.items:
         return [f"{stage.stage:<11} not done"]
     counts = (
-        f"{stage.part + stage.stage:<11} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
-        f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
+        f"{stage.part + stage.stage:<11} {stage.items:>7} {form(stage.items, 'item')}, {stage.done} done, "
+        f"{stage.skipped} up to date, {len(stage.failures)} failed, {stage.seconds:.1f} s"
     )
     return [counts, *(f"          {line}" for line in _found(stage, names, part=part))]
 

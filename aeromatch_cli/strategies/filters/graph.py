@@ -11,6 +11,7 @@ from aeromatch_cli.data import BoolArray, Candidates, FloatArray, IntArray, Pair
 from aeromatch_cli.geometry.affinities import joint_places, local_support, nearest_matches
 from aeromatch_cli.geometry.two_view import undistorted
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.words import form
 
 # The first round only clears the field, so that the second one's neighbours are true ones: it takes this many times the
 # threshold and asks for the least support alone.
@@ -76,7 +77,8 @@ class Graph(Strategy):
         """errors_px stay unknown: support has no pixels. Nothing is drawn at random."""
         points0, points1, usable = undistorted(candidates.points0_px, candidates.points1_px, geometry)
         if len(points0) < self.min_matches:
-            return _passed(len(usable), f"{len(points0)} matches are too few to compare with their neighbours")
+            few = form(len(points0), "match is", "matches are")
+            return _passed(len(usable), f"{len(points0)} {few} too few to compare with their neighbours")
         alive = np.arange(len(points0))
         for fine in (False, True):
             alive = alive[self._supported(points0[alive], points1[alive], fine)]
