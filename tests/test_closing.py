@@ -131,7 +131,8 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
             {"spread": {"a": [7, 2, 99]}},
             [
                 "good",
-                "1 of 4 images (a.jpg) has no point in a ninth of the picture or more whose ground other images show",
+                "1 of 4 images (a.jpg) has no point in one or more of the 3 x 3 parts of the picture whose ground "
+                "other images show: less evenly tied, which does not change the verdict",
             ],
         ),
     ],

@@ -14,7 +14,7 @@ from make_results import filled
 from aeromatch_cli.data import Pair
 from aeromatch_cli.report.rows import _details
 from aeromatch_cli.report.show import _Partner
-from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, FilterResult
+from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, FilterResult, MatchResult
 from aeromatch_cli.stages import messages, unregistered
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.filters.gate import shortage
@@ -98,6 +98,16 @@ def test_a_stage_of_one_item_and_a_pair_of_one_match() -> None:
     assert shortage(1, 1, 15) == "1 inlier of 1 match, 15 needed"
     assert shortage(3, 40, 15) == "3 inliers of 40 matches, 15 needed"
     assert _Partner("a.jpg", 1, "verified", 0.5).words == "a.jpg: 1 match, verified, overlap 50 %"
+
+
+def test_pairs_that_have_enough_matches_after_a_step() -> None:
+    found = MatchResult(settled_by={"first": 1, "learned": 0}, not_settled=0)
+    assert messages.settled_words(found) == "1 of 1 pair has enough matches after step first, 0 more after learned"
+    found = MatchResult(settled_by={"first": 4, "learned": 2}, not_settled=1)
+    lacking = "1 has fewer matches, or less of the overlap covered, than the last step asks for"
+    enough = "4 of 7 pairs have enough matches after step first, 2 more after learned"
+    assert messages.settled_words(found) == f"{enough}; {lacking}"
+    assert messages.settled_words(MatchResult()) == ""
 
 
 def test_stages_of_the_page_count_one_thing() -> None:

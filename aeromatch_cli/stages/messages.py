@@ -80,13 +80,11 @@ def settled_words(found: MatchResult) -> str:
         return ""
     by, lacking = found.settled_by, found.not_settled
     whole = sum(by.values()) + lacking
-    counts = ", ".join(f"{count} by {name}" for name, count in by.items())
-    lack = (
-        f"; {lacking} with fewer matches, or less of the overlap covered, than the last step asks for"
-        if lacking
-        else ""
-    )
-    return f"of {whole} pairs settled: {counts}{lack}"
+    (first, count), *further = by.items()
+    words = f"{count} of {whole} {form(whole, 'pair')} {form(count, 'has', 'have')} enough matches after step {first}"
+    words += "".join(f", {more} more after {name}" for name, more in further)
+    fewer = f"{form(lacking, 'has', 'have')} fewer matches, or less of the overlap covered, than the last step asks for"
+    return f"{words}; {lacking} {fewer}" if lacking else words
 
 
 def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) -> list[str]:

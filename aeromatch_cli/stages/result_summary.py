@@ -40,8 +40,9 @@ def _weak(results: BlockResults, names: Mapping[str, str]) -> list[str]:
         lines.append(f"weak: {named}, with fewer than {FEW_POINTS} points that three images see")
     empty = [i for i, ninths in spread.items() if ninths.empty]
     if empty:
+        lacking = of_images((names.get(i, i) for i in empty), spread, "has", "have")
         lines.append(
-            f"{of_images((names.get(i, i) for i in empty), spread, 'has', 'have')} no point in a ninth of the picture "
-            "or more whose ground other images show: less evenly tied, which does not change the verdict"
+            f"{lacking} no point in one or more of the 3 x 3 parts of the picture whose ground other images show: "
+            "less evenly tied, which does not change the verdict"
         )
     return lines
