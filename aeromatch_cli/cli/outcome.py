@@ -145,6 +145,7 @@ class Weights(Line):
     weights: list[str] | dict[str, str] | None = Field(None, description="Names in the folder; verify: name -> state.")
     shipped: list[str] | dict[str, str] | None = Field(None, description="The same of those of the package.")
     packages: list[str] | None = Field(None, description="Published ones that installed packages hold.")
+    not_found: list[str] | None = Field(None, description="Published ones that are nowhere.")
     name: str | None = Field(None, description="Of the file that was added.")
 
 

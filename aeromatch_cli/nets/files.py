@@ -65,6 +65,11 @@ def shipped_path(name: str) -> Path:
     return path
 
 
+def ships(path: Path) -> bool:
+    """Whether a file has the contents of the network of its name that ships."""
+    return sha256_of_file(path) == sha256_of_file(shipped_path(path.stem))
+
+
 def shipped_weights() -> tuple[WeightsEntry, ...]:
     """Every file that ships with the package, by name; its architecture is its name's."""
     paths = sorted(SHIPPED_FOLDER.glob("*.safetensors"))

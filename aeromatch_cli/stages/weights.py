@@ -27,12 +27,16 @@ def manage_weights(action: str, path: str | None) -> Result:
     table = [(e, "  (ships, used without a setting)") for e in shipped]
     table += [(e, f"  ({terms})" if (terms := published.terms_of(e.sha256)) else "") for e in entries]
     table += [(e, f"  ({published.terms_of(e.sha256) or 'not as published'}; in an installed package)") for e in others]
+    lacking = published.not_found()
+    absent = [f"{p.file}  {p.architecture}  not found  ({p.source}; {p.licence})" for p in lacking]
+    absent += [f"published weights that were not found: {published.HOW_TO_GET}"] if lacking else []
     listed = tuple(f"{e.name}  {e.architecture}  {e.size_bytes / 1e3:,.0f} kB  {e.sha256}{note}" for e, note in table)
     return Result(
-        (*listed, *(() if entries else (nothing,))),
+        (*listed, *(() if entries else (nothing,)), *absent),
         {
             "weights": [e.name for e in entries],
             "shipped": [e.name for e in shipped],
             "packages": [e.name for e in others],
+            "not_found": [p.file for p in lacking],
         },
     )

@@ -90,6 +90,8 @@ class Learned(Described):
 
     def check_files(self, descriptor_length: int) -> None:
         """Weights of a user are loaded once; the device is looked for."""
+        from aeromatch_cli.nets.files import ships
+
         super().check_files(descriptor_length)
         check_device(self.device)
         if self.weights is None:
@@ -106,7 +108,7 @@ class Learned(Described):
             )
         for name in own:
             self._network(name)
-        if self.context and "geodesc" in own and "context" not in own:
+        if self.context and "geodesc" in own and "context" not in own and not ships(self._path("geodesc")):
             raise ConfigError(
                 f"extract.weights {self.weights!r} holds descriptors of your own, geodesc.safetensors, and no "
                 "context.safetensors that was trained on them: make it by scripts/train context --weights, or set "
