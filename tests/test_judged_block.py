@@ -229,3 +229,18 @@ def test_two_images_are_matched_without_orientation(site: Site) -> None:
     assert outcome.code == 0
     assert "at least 3 images must have verified matches with others, 2 have some" in outcome.stderr
     assert (site.work / "export" / "colmap" / "database.db").is_file()
+
+
+@pytest.mark.slow
+def test_the_poses_of_two_images_are_too_few_to_be_called_wrong(site: Site) -> None:
+    for _ in range(2, IMAGES):
+        site.image(2).unlink()
+    outcome = site("run")
+    assert outcome.code == 0
+    (positions,) = [
+        group["positions"] for group in outcome.facts["stages"]["adjust"]["result"]["groups"] if group["positions"]
+    ]
+    assert (positions["images"], positions["used"], positions["wrong"]) == (2, 0, [])
+    words = "2 given positions are too few to take part in the adjustment, which takes three"
+    assert any(one["sentence"].startswith(words) for one in outcome.facts["quality"]["findings"])
+    assert "contradict the pictures" not in outcome.stdout

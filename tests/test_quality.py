@@ -73,6 +73,7 @@ def heights(**changes: float) -> dict[str, Any]:
     return {"heights": GROUP["heights"] | changes}
 
 
+NONE_USED = {"rms_m": None, "rms_sigmas": None}
 TURNED = {"rotation_sigmas_median": [5.0, 5.0, 0.1], "rotation_deg_median": [5.0, 5.0, 0.1]}
 CONTROL = {
     "points": 5, "control": 3, "check": 2, "doubtful": [], "check_rmse_m": [0.02, 0.02, 0.03],
@@ -151,6 +152,52 @@ def test_one_fault_decides_with_its_number(changes: dict[str, Any], what: str, v
     if level != "good":
         assert quality.findings[0].what == what
         assert ": " in finding.sentence, "the remedy follows"
+
+
+def test_a_single_pair_does_not_tell_what_is_wrong() -> None:
+    pair = {"images": 2, "components": [2]}
+    group = {"kind": "given", "images": 2} | positions(images=2, used=0, wrong=["a", "b"], **NONE_USED)
+    words = (
+        "2 of 2 given positions are not used: with the angles and the focal length they do not fit the pictures, and a "
+        "single pair does not tell which of these is wrong; "
+    )
+    finding = found(judged_with(group=group, adjust={"images": 2}, **pair), "wrong positions")
+    tell = "a third image that overlaps both, or control points, tell"
+    assert (finding.level, finding.sentence) == ("doubtful", words + tell)
+    finding = found(judged_with(group=group, adjust={"images": 2, "guessed_cameras": ["c"]}, **pair), "wrong positions")
+    guess = (
+        "the likely cause is the focal length of camera c, which is a guess, since EXIF says too little: give "
+        "--cameras FILE"
+    )
+    assert (finding.level, finding.sentence) == ("doubtful", words + guess)
+
+
+def test_two_positions_are_too_few_to_be_wrong() -> None:
+    group = {"kind": "given", "images": 2} | positions(images=2, used=0, **NONE_USED)
+    quality = judged_with(group=group, adjust={"images": 2}, images=2, components=[2])
+    finding = found(quality, "wrong positions")
+    assert (finding.level, finding.sentence) == (
+        "good",
+        "2 given positions are too few to take part in the adjustment, which takes three: scale, north and place are "
+        "those of the given poses",
+    )
+
+
+def test_a_guessed_focal_length_is_named_where_many_positions_do_not_fit() -> None:
+    guessed = {"guessed_cameras": ["camera_1"]}
+    guess = (
+        "the likely cause is the focal length of camera camera_1, which is a guess, since EXIF says too little: give "
+        "--cameras FILE"
+    )
+    quality = judged_with(group=positions(used=7, wrong=list("abcde")), adjust=guessed)
+    assert found(quality, "wrong positions").sentence == (
+        "5 of 12 given positions contradict the pictures and are not used: a, b, c, d, e; "
+        f"{guess}; otherwise check which position belongs to which image"
+    )
+    one = judged_with(group=positions(used=11, wrong=["a"]), adjust=guessed)
+    assert "focal length" not in found(one, "wrong positions").sentence
+    off = judged_with(group=positions(rms_sigmas=[25.0, 25.0, 1.0]), adjust=guessed)
+    assert found(off, "positions horizontally").sentence.endswith(f"or correct their cause; {guess}")
 
 
 def test_the_step_between_two_flights_is_said_with_its_size() -> None:

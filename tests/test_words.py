@@ -14,7 +14,7 @@ from make_results import filled
 from aeromatch_cli.data import Pair
 from aeromatch_cli.report.rows import _details
 from aeromatch_cli.report.show import _Partner
-from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, FilterResult, MatchResult
+from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, FilterResult, MatchResult, OrientResult
 from aeromatch_cli.stages import messages, unregistered
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.filters.gate import shortage
@@ -98,6 +98,23 @@ def test_a_stage_of_one_item_and_a_pair_of_one_match() -> None:
     assert shortage(1, 1, 15) == "1 inlier of 1 match, 15 needed"
     assert shortage(3, 40, 15) == "3 inliers of 40 matches, 15 needed"
     assert _Partner("a.jpg", 1, "verified", 0.5).words == "a.jpg: 1 match, verified, overlap 50 %"
+
+
+def test_a_guessed_focal_length_is_named_where_many_positions_are_wrong() -> None:
+    pose = SimpleNamespace(world_rotation=None)
+    block: Any = SimpleNamespace(
+        images=[SimpleNamespace(image_id=name, name=f"{name}.jpg") for name in "abc"],
+        poses=dict.fromkeys("abc", pose),
+        crs="local",
+    )
+    found = filled(OrientResult, poses_from="pictures", frame="world", wrong_positions={"a": 40.0, "b": 30.0})
+    lines = [line.strip() for line in messages.orientation_lines(found, block, block, {"camera_1"})]
+    assert lines[-2:] == [
+        "wrong positions given; those that the pictures give are used: a.jpg (40 m), b.jpg (30 m)",
+        "the likely cause is the focal length of camera camera_1, which is a guess, since EXIF says too little: give "
+        "--cameras FILE",
+    ]
+    assert "focal length" not in messages.orientation_lines(found, block, block)[-1]
 
 
 def test_pairs_that_have_enough_matches_after_a_step() -> None:

@@ -238,6 +238,7 @@ class AdjustResult(StageResult):
     outside: dict[str, str] = Field({}, description="Images without adjusted pose -> reason.")
     stopped: str = Field("", description="Why the adjustment stopped, empty where it did not.")
     held_by: dict[str, str] = Field({}, description="Parameter of cameras -> setting that holds it.")
+    guessed_cameras: list[str] = Field([], description="Cameras whose focal length was a guess at first.")
     readout_not_tried: str | None = Field(
         None, description="Why the read-out time of a rolling shutter was no unknown, null where it was."
     )

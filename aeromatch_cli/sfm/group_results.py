@@ -29,7 +29,7 @@ from aeromatch_cli.results.adjustment import (
 from aeromatch_cli.sfm.bundle.adjust import position_residuals_m
 from aeromatch_cli.sfm.bundle.covariance import Covariance, lens_correlations
 from aeromatch_cli.sfm.bundle.network import FLIGHT, LENS, MOUNT, SLOPES, Network, Unknowns
-from aeromatch_cli.sfm.model_adjustment import Given, Outcome
+from aeromatch_cli.sfm.model_adjustment import WRONG_SIGMAS, Given, Outcome
 
 # Correlations that are stated, and how many of them.
 _STRONG, _MOST_LISTED = 0.9, 5
@@ -67,7 +67,7 @@ def adjusted_group(group: GroupResult, outcome: Outcome, given: Given, names: Na
     return group.model_copy(
         update={
             "sigma_px": outcome.result.sigma_px,
-            "positions": _positions(outcome, given, names),
+            "positions": _positions(group.kind, outcome, given, names),
             "flights": _flights(outcome, names),
             "mounts": _mounts(outcome, names),
             "calibration": {names.camera(n): _calibration(outcome, k, names) for k, n in enumerate(outcome.cameras)},
@@ -76,10 +76,11 @@ def adjusted_group(group: GroupResult, outcome: Outcome, given: Given, names: Na
     )
 
 
-def _positions(outcome: Outcome, given: Given, names: Names) -> PositionResiduals | None:
+def _positions(kind: str, outcome: Outcome, given: Given, names: Names) -> PositionResiduals | None:
     """Return how positions agree with the adjusted block.
 
-    Positions that were left out before the adjustment, because they lay too far off, count as wrong ones.
+    Positions that were left out before the adjustment, because they lay too far off, count as wrong ones. Where given
+    poses have too few positions for these to be used, only those count that lie too far off.
     """
     result, rows = outcome.result, np.array(outcome.images, dtype=int) - 1
     steps_m = 0.0 if outcome.steps_m is None else outcome.steps_m[rows][:, None] * [0.0, 0.0, 1.0]
@@ -90,10 +91,13 @@ def _positions(outcome: Outcome, given: Given, names: Names) -> PositionResidual
     if not known.any():
         return None
     off_m = position_residuals_m(stated, result.state)
+    wrong = known & ~used
+    if kind == "given" and not used.any():
+        wrong &= np.linalg.norm(off_m, axis=1) > WRONG_SIGMAS * given.mean_sigmas_m[rows]
     return PositionResiduals(
         images=int(known.sum()),
         used=int(used.sum()),
-        wrong=[names.image(outcome.images[k]) for k in np.flatnonzero(known & ~used)],
+        wrong=[names.image(outcome.images[k]) for k in np.flatnonzero(wrong)],
         rms_m=_rms(off_m[used]),
         rms_sigmas=_rms((off_m / stated.position_sigmas_m)[used]),
         stated_m=xyz(np.median(stated.position_sigmas_m[known], axis=0)),

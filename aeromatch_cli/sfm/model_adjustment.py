@@ -54,7 +54,7 @@ _LENS_POINTS = 500
 # So many positions hold a model in the world frame.
 _HOLDING = 3
 # A position that is so many standard deviations away is not that of the image.
-_WRONG_SIGMAS = 5.0
+WRONG_SIGMAS = 5.0
 # Positions beyond so many standard deviations, and this share of the flying height, are no observations of an
 # adjustment in the making.
 _FAR_SIGMAS, _NEAR_SHARE = 10.0, 0.05
@@ -210,7 +210,7 @@ def adjust_in_place(
     ids = image_numbers(model)
     rows = np.array(ids, dtype=int) - 1
     off_m = np.linalg.norm(centers_of(model, ids) - given.positions_m[rows], axis=1)
-    counts = off_m <= _WRONG_SIGMAS * given.mean_sigmas_m[rows]
+    counts = off_m <= WRONG_SIGMAS * given.mean_sigmas_m[rows]
     counts &= counts.sum() >= _HOLDING
     known = np.isin(ids, list(observed))
     sigmas = np.where(known, np.deg2rad(given.sigmas_deg[rows]), np.inf)

@@ -190,6 +190,7 @@ def _result(
         reduced=_reduced(context),
         outside=unregistered_reasons(context, adjusted, without_results),
         held_by=_held_by(context),
+        guessed_cameras=sorted(context.given.guessed_cameras & adjusted.cameras.keys()),
         readout_not_tried=readout_not_tried(context, adjusted.poses),
         control=control,
         remarks=_remarks(context, adjusted, groups, control),

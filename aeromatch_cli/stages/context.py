@@ -70,6 +70,11 @@ class Given:
     control: tuple[ControlPoint, ...] = ()
     remote: Mapping[str, RemoteFile] = field(default_factory=dict)
 
+    @property
+    def guessed_cameras(self) -> frozenset[str]:
+        """Cameras whose focal length was no more than a guess."""
+        return frozenset(i for i, sigma in self.focal_sigmas.items() if sigma >= _GUESS)
+
 
 @dataclass(frozen=True, eq=False)
 class Scope:
@@ -168,7 +173,7 @@ class Context:
     @property
     def guessed_cameras(self) -> frozenset[str]:
         """Cameras whose focal length is no more than a guess."""
-        return frozenset(i for i, sigma in self.given.focal_sigmas.items() if sigma >= _GUESS) - self.block.calibrated
+        return self.given.guessed_cameras - self.block.calibrated
 
     def owns(self, item_id: str) -> bool:
         return self.scope.shard is None or self.scope.shard.owns(item_id)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from aeromatch_cli.data import Block
 from aeromatch_cli.results.adjustment import Control, ControlInGroup, GroupResult, Xyz
@@ -19,6 +19,7 @@ from aeromatch_cli.results.stages import (
 )
 from aeromatch_cli.sfm.control import offset_words
 from aeromatch_cli.sfm.mapping import Group
+from aeromatch_cli.sfm.quality.finding import MANY_WRONG_POSITIONS, guess_words
 from aeromatch_cli.stages.filter import WEAK_MATCHES
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.words import MANY, form, listed
@@ -105,8 +106,11 @@ def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) 
     return lines
 
 
-def orientation_lines(found: OrientResult, given: Block, block: Block) -> list[str]:
-    """Say how the block was oriented, and what of the given poses and cameras is wrong."""
+def orientation_lines(
+    found: OrientResult, given: Block, block: Block, guessed_cameras: Collection[str] = ()
+) -> list[str]:
+    """Say how the block was oriented, and what of the given poses and cameras is wrong. guessed_cameras: those whose
+    focal length was a guess."""
     names = {image.image_id: image.name for image in block.images}
     words = _given_words(found, given) if found.poses_from == "given poses" else _picture_words(found, given, block)
     for camera_id, focal in found.focal_lengths.items():
@@ -119,6 +123,8 @@ def orientation_lines(found: OrientResult, given: Block, block: Block) -> list[s
             named = listed((f"{names[i]} ({value:.0f} {unit})" for i, value in wrong.items()), MANY)
             done = "kept, as orient=given asks" if found.stays else "those that the pictures give are used"
             words.append(f"wrong {what} given; {done}: {named}")
+    if len(found.wrong_positions) > MANY_WRONG_POSITIONS * len(given.poses):
+        words += filter(None, [guess_words(sorted(guessed_cameras))])
     if found.outside:
         words.append(f"not oriented: {listed((names[i] for i in found.outside), MANY)}")
     return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]

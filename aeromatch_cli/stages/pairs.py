@@ -81,7 +81,11 @@ def prepare(
     pairs = _listed(context, report, anew=overwrite or dry)
     summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
     as_oriented = oriented.result if isinstance(oriented.result, OrientResult) else None
-    oriented_lines = [] if as_oriented is None else orientation_lines(as_oriented, found.given.block, context.block)
+    oriented_lines = (
+        []
+        if as_oriented is None
+        else orientation_lines(as_oriented, found.given.block, context.block, found.given.guessed_cameras)
+    )
     remarks = [] if as_oriented is None else as_oriented.remarks
     said_later = [*remarks, *(w for w in summary.warnings if w not in known)]
     before = result_on_file(workspace, PairsResult)

@@ -14,14 +14,15 @@ from aeromatch_cli.results.adjustment import (
 )
 from aeromatch_cli.results.record import Record
 from aeromatch_cli.results.stages import AdjustResult, OrientResult
-from aeromatch_cli.words import listed
+from aeromatch_cli.words import form, listed
 
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
 # Each pair: doubtful beyond the first, bad beyond the second; None: never bad by itself.
 Limits = tuple[float, float | None]
 # Of the given positions, the share that the pictures contradict: single wrong ones happen.
-WRONG_POSITIONS: Limits = (0.05, 0.3)
+MANY_WRONG_POSITIONS = 0.3
+WRONG_POSITIONS: Limits = (0.05, MANY_WRONG_POSITIONS)
 WHOLE_BLOCK = "the block"
 
 
@@ -130,6 +131,15 @@ def angles_given(evidence: QualityInput) -> bool:
     """Whether oriented images have given angles."""
     residuals = evidence.adjust.residuals
     return residuals is not None and residuals.rotation_deg_median is not None
+
+
+def guess_words(camera_ids: Sequence[str]) -> str:
+    """Say that a guessed focal length is what the poses do not fit, "" where none was guessed. camera_ids: those whose
+    focal length was."""
+    if not camera_ids:
+        return ""
+    of = f"the focal length of {form(len(camera_ids), 'camera')} {listed(camera_ids)}"
+    return f"the likely cause is {of}, which is a guess, since EXIF says too little: give --cameras FILE"
 
 
 def flight_words(name: str) -> str:

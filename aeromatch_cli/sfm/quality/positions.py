@@ -13,6 +13,7 @@ from aeromatch_cli.results.adjustment import (
 from aeromatch_cli.sfm.heights import shift_to_control_m
 from aeromatch_cli.sfm.quality.calibration import with_held
 from aeromatch_cli.sfm.quality.finding import (
+    MANY_WRONG_POSITIONS,
     WRONG_POSITIONS,
     Finding,
     Found,
@@ -20,6 +21,7 @@ from aeromatch_cli.sfm.quality.finding import (
     QualityInput,
     finding_of,
     flight_words,
+    guess_words,
     plain,
     positions_given,
     rms,
@@ -53,10 +55,27 @@ def positions(evidence: QualityInput) -> Found:
         return
     images = sum(one.images for one in found)
     wrong = [i for one in found for i in one.wrong]
-    remedy = f"{evidence.named(wrong)}; check which position belongs to which image"
-    verbs = ("contradicts", "is") if len(wrong) == 1 else ("contradict", "are")
-    words = f"{len(wrong)} of {images} given positions {verbs[0]} the pictures and {verbs[1]} not used"
-    yield finding_of("wrong positions", len(wrong) / images, WRONG_POSITIONS, words, remedy)
+    guess = guess_words(evidence.adjust.guessed_cameras)
+    if wrong and evidence.adjust.images == 2:
+        words = (
+            f"{len(wrong)} of {images} given positions {form(len(wrong), 'is', 'are')} not used: with the angles and "
+            "the focal length they do not fit the pictures, and a single pair does not tell which of these is wrong"
+        )
+        said = f"{words}; {guess or 'a third image that overlaps both, or control points, tell'}"
+        yield Finding("wrong positions", len(wrong) / images, WRONG_POSITIONS[0], "doubtful", said)
+    elif not wrong and not any(one.used for one in found):
+        words = (
+            f"{images} given {form(images, 'position is', 'positions are')} too few to take part in the adjustment, "
+            "which takes three: scale, north and place are those of the given poses"
+        )
+        yield Finding("wrong positions", 0.0, WRONG_POSITIONS[0], "good", words)
+    else:
+        verbs = ("contradicts", "is") if len(wrong) == 1 else ("contradict", "are")
+        words = f"{len(wrong)} of {images} given positions {verbs[0]} the pictures and {verbs[1]} not used"
+        remedy = f"{evidence.named(wrong)}; check which position belongs to which image"
+        if guess and len(wrong) > MANY_WRONG_POSITIONS * images:  # single ones are wrong by themselves
+            remedy = f"{evidence.named(wrong)}; {guess}; otherwise check which position belongs to which image"
+        yield finding_of("wrong positions", len(wrong) / images, WRONG_POSITIONS, words, remedy)
     met = [(one.rms_sigmas, one.rms_m, one.stated_m) for one in found if one.rms_sigmas and one.rms_m]
     if not met:
         return
@@ -65,7 +84,7 @@ def positions(evidence: QualityInput) -> Found:
     remedy = (
         "they are less exact than stated, or another focal length, time or antenna offset stands behind it; state "
         "their real accuracy, or correct their cause"
-    )
+    ) + (f"; {guess}" if guess else "")
     for name, axes in (("horizontally", "xy"), ("vertically", "z")):
         of = ["xyz".index(axis) for axis in axes]
         sigmas, off_m, stated_m = (
