@@ -5,6 +5,7 @@ that rises by 1 m in 10 degrees to the east."""
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,7 @@ from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.crs import ELLIPSOID, checked_heights, converted_heights, grid_from_geographic, heights_of
-from aeromatch_cli.blocks.ground import DemGround, open_dem
+from aeromatch_cli.blocks.ground import ConstantGround, DemGround, open_dem
 from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.blocks.read import GivenHeights
 from aeromatch_cli.data import Image, Pose
@@ -212,7 +213,7 @@ ORIENTED = filled(OrientResult, frame="world", points=1000)
 def test_a_dem_with_another_zero_is_used_shifted_and_the_offset_named(off_m: float) -> None:
     """The smallest is 8 % of the flying height: more than positions of 0.03 m leave open."""
     context = dem_context(TERRAIN, TERRAIN.heights_m + off_m, 0.03)
-    ground, source, (remark,) = judged_ground(context, [TERRAIN], ORIENTED)
+    ground, source, (remark,) = judged_ground(context, [TERRAIN], ORIENTED, context.block.poses)
     places = np.array([[50.0, -50.0], [120.0, -30.0]])
     np.testing.assert_allclose(ground.height_m(places), context.block.ground.height_m(places) - off_m, atol=1e-9)
     assert source == f"DEM dem.tif, {'raised' if off_m < 0 else 'lowered'} by {abs(off_m):.1f} m"
@@ -222,13 +223,39 @@ def test_a_dem_with_another_zero_is_used_shifted_and_the_offset_named(off_m: flo
     assert ("unless trees or roofs cover the ground" in remark) == (off_m == -8.0)
 
 
+@pytest.mark.parametrize(
+    ("error_m", "images", "ground_m", "said"),
+    [
+        (2.0, 1000, 332.0, True),  # three standard deviations of 5 m, as stated, are 15 m
+        (9.0, 1000, 332.0, False),  # 15.6 m off in space: 10 m for each coordinate, three times that is 30 m
+        (0.0, 2, 324.0, False),  # 30 m apart, 5 m exact: nothing tells the scale to a quarter of the flying height
+        (0.0, 2, 342.0, True),  # views of such a ground would miss each other
+    ],
+)
+def test_the_ground_is_doubted_only_as_far_as_positions_tell_it(
+    error_m: float, images: int, ground_m: float, said: bool
+) -> None:
+    """The terrain lies at 310 m in the middle of all images, and at 302 m below the first two; these fly at 400 m."""
+    context = dem_context(TERRAIN, TERRAIN.heights_m, 5.0)
+    context.block.ground, context.block.ground_source = ConstantGround(ground_m), "given"
+    context.block.poses = dict(list(context.block.poses.items())[:images])
+    oriented = {
+        i: replace(pose, center_m=pose.center_m + error_m * (-1.0) ** int(i)) for i, pose in context.block.poses.items()
+    }
+    assert bool(judged_ground(context, [TERRAIN], ORIENTED, oriented)[2]) == said
+
+
 def test_a_dem_that_agrees_or_has_another_shape_is_not_shifted() -> None:
     agreeing = dem_context(TERRAIN, TERRAIN.heights_m + 3.0, 0.03)
-    assert judged_ground(agreeing, [TERRAIN], ORIENTED) == (agreeing.block.ground, "DEM dem.tif", [])
+    assert judged_ground(agreeing, [TERRAIN], ORIENTED, agreeing.block.poses) == (
+        agreeing.block.ground,
+        "DEM dem.tif",
+        [],
+    )
     uncertain = dem_context(TERRAIN, TERRAIN.heights_m + 12.0, 5.0)  # three standard deviations of GPS
-    assert judged_ground(uncertain, [TERRAIN], ORIENTED)[2] == []
+    assert judged_ground(uncertain, [TERRAIN], ORIENTED, uncertain.block.poses)[2] == []
     hill = 60.0 * np.sin(np.arange(20) / 3.0)[:, None] + TERRAIN.heights_m - 80.0
-    ground, source, (remark,) = judged_ground(dem_context(TERRAIN, hill, 0.03), [TERRAIN], ORIENTED)
+    ground, source, (remark,) = judged_ground(dem_context(TERRAIN, hill, 0.03), [TERRAIN], ORIENTED, {})
     assert (source, "The terrain of the pictures is used" in remark) == (
         "terrain from 1000 points of the first pass",
         True,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,18 +10,20 @@ import numpy as np
 from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGrounds, open_dem, stated_height_m
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, FloatArray, Ground
+from aeromatch_cli.data import Block, FloatArray, Ground, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.results.stages import OrientResult
 from aeromatch_cli.sfm.dem import Terrain
-from aeromatch_cli.sfm.epipolar_agreement import heights_above_m
+from aeromatch_cli.sfm.epipolar_agreement import heights_above_m, position_errors_m
 from aeromatch_cli.sfm.heights import height_remedy, zeros_words
 from aeromatch_cli.stages.context import Context
 
 # A stated ground that differs from the terrain of the pictures by this share of the flying height is said; so is one
 # that differs by more than so many standard deviations of a position, whichever is more.
 _SAID_SHARE, _SAID_SIGMAS = 0.1, 3.0
+# Median length of a vector whose three coordinates have a standard deviation of 1.
+_MEDIAN_DISTANCE = 1.54
 # A DEM is more exact than a height that somebody states. It has the shape of the terrain, and its heights count from
 # another zero, where it differs by nearly the same everywhere: second share, median deviation from the median.
 _DEM_SHARE, _ALIKE_SHARE = 0.05, 0.03
@@ -60,12 +62,12 @@ def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None
 
 
 def judged_ground(
-    context: Context, terrains: Sequence[Terrain], found: OrientResult
+    context: Context, terrains: Sequence[Terrain], found: OrientResult, oriented: Mapping[str, Pose]
 ) -> tuple[Ground | None, str, list[str]]:
     """Return the ground that later stages use, where it comes from in words, and what contradicts it.
 
-    terrains: of the pictures, one for each flight. found: by the orientation. A stated ground wins, unless it
-    cannot be right.
+    terrains: of the pictures, one for each flight. found: by the orientation. oriented: the poses that it has given
+    images. A stated ground wins, unless it cannot be right.
     """
     ground, source = context.block.ground, context.block.ground_source
     own_frame = found.frame == "own"
@@ -84,7 +86,10 @@ def judged_ground(
     share, sigma_m = _SAID_SHARE, context.settings.block.sigma_position_m
     if isinstance(ground, DemGround):
         share, sigma_m = _DEM_SHARE, float(np.median([p.axis_sigmas_m[2] for p in context.block.poses.values()]))
-    if abs(off_m) <= max(share * flying_m, _SAID_SIGMAS * sigma_m):
+    terrain_m = _terrain_sigma_m(context.block.poses, oriented, sigma_m, flying_m)
+    # However inexact positions are: views and footprints are made by the poses as they are.
+    excused_m = min(_SAID_SIGMAS * terrain_m, max(_SAID_SIGMAS * sigma_m, _WRONG_SHARE * flying_m))
+    if abs(off_m) <= max(share * flying_m, excused_m):
         return ground, source, []
     remark = (
         f"the ground ({source}) lies {abs(off_m):.1f} m {'above' if off_m > 0 else 'below'} the terrain that the "
@@ -101,6 +106,20 @@ def judged_ground(
     remark += ": do heights and ground count from the same zero (ellipsoid, sea level, take-off point)?"
     keeps = context.settings.keeps_poses or abs(off_m) <= _WRONG_SHARE * flying_m
     return (ground, source, [remark]) if keeps else (shown, words, [f"{remark} The terrain of the pictures is used"])
+
+
+def _terrain_sigma_m(
+    given: Mapping[str, Pose], oriented: Mapping[str, Pose], stated_m: float, flying_m: float
+) -> float:
+    """Return how exactly positions tell the height of the terrain of the pictures: as they are stated, or as they fit
+    these where that is worse. What they are off by changes the scale, and that the flying height."""
+    off_m = list(position_errors_m(given, oriented).values())
+    if not off_m:
+        return stated_m
+    sigma_m = max(stated_m, float(np.median(off_m)) / _MEDIAN_DISTANCE)
+    centers_m = np.array([oriented[i].center_m for i in given.keys() & oriented.keys()])
+    extent_m = float(np.linalg.norm(centers_m - centers_m.mean(axis=0)))
+    return sigma_m * max(1.0, flying_m / max(extent_m, 1e-9))
 
 
 def judged_altitudes(

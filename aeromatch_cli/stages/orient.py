@@ -111,7 +111,9 @@ def run(
     report.record_files(context, _files(context, record))
     folder = context.workspace.orientation
     found = record.result
-    ground, source, ground_remarks = judged_ground(context, _terrains(context, record), found)
+    ground, source, ground_remarks = judged_ground(
+        context, _terrains(context, record), found, read_poses(folder / "poses.csv")
+    )
     remarks = [*found.remarks, *frame_remarks(found, _groups(record)), *ground_remarks]
     remarks += judged_altitudes(ground, context.block, found, altitudes)
     report.result = found.model_copy(update={"remarks": remarks})
