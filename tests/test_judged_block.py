@@ -244,3 +244,14 @@ def test_the_poses_of_two_images_are_too_few_to_be_called_wrong(site: Site) -> N
     words = "2 given positions are too few to take part in the adjustment, which takes three"
     assert any(one["sentence"].startswith(words) for one in outcome.facts["quality"]["findings"])
     assert "contradict the pictures" not in outcome.stdout
+
+
+@pytest.mark.slow
+def test_an_image_that_cannot_be_read_counts_once_in_every_stage(site: Site) -> None:
+    broken = site.image(0)
+    broken.write_bytes(broken.read_bytes()[:3000])
+    for count in ("done", "skipped"):
+        stages = site("run").facts["stages"]
+        for stage in ("orient", "extract"):
+            counts = stages[stage]
+            assert (counts["items"], counts[count], counts["failed"]) == (IMAGES, IMAGES - 1, 1), (stage, counts)

@@ -22,7 +22,7 @@ from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Pose
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.report.pictures import image_picture, pair_picture
-from aeromatch_cli.report.show import _pose_lines
+from aeromatch_cli.report.show import _pass_lines, _pose_lines
 from aeromatch_cli.report.tiles import aligned
 from aeromatch_cli.results.stages import OrientResult
 from aeromatch_cli.stages.stage_report import StageReport
@@ -178,6 +178,16 @@ def test_show_reads_files(done_site: Site) -> None:
 def test_show_refuses_what_is_not_there(done_site: Site, arguments: tuple[str, ...], code: int, words: str) -> None:
     outcome = invoke("show", done_site.work, *arguments)
     assert (outcome.code, words in outcome.stderr) == (code, True), outcome.stderr
+
+
+def test_the_steps_of_a_pair_count_before_the_last_drops(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path)
+    rows = ["image_id0,image_id1,steps,reasons", "a,b,first+guided,guided: 7 verified matches", "a,c,first,"]
+    workspace.steps.write_text("\n".join(rows) + "\n")
+    assert list(_pass_lines(workspace, ("a", "b"))) == [
+        "steps       first+guided: guided: 7 verified matches (counted before the stage consistency dropped matches)"
+    ]
+    assert list(_pass_lines(workspace, ("a", "c"))) == ["steps       first"]
 
 
 def test_a_folder_that_is_no_workspace(tmp_path: Path) -> None:

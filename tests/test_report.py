@@ -168,6 +168,11 @@ def test_an_image_that_could_not_be_read_is_told_as_nothing_else(full):
     assert "1 connected group" in words
     assert "unconnected groups" not in words
     assert row_with(page_of(full), "image-table", "sub/d.png")[-1] == "could not be read."
+    counted = (
+        "An image that could not be read fails in orient and in extract, each time it is tried; match and what follows "
+        "leave out its pairs."
+    )
+    assert counted in page_of(full)
 
 
 def test_rows_hold_the_numbers_of_the_workspace(full):
@@ -216,6 +221,18 @@ def test_images_tell_their_views_and_shadow(full):
     write_json(full.workspace.enhanced("b", ".json"), {"shadow_share": 0.34, "fingerprint": "x"})
     of_b = gather(full).images[1]
     assert (of_b.views, of_b.shadow) == (2, 0.34)
+
+
+def test_steps_tell_that_their_counts_are_of_before_the_last_drops(full):
+    assert "dropped some; the column Verified" not in page_of(full)
+    lines = ["image_id0,image_id1,steps,reasons,settled_by,lacks,verified,expected", "a,b,first,,first,,60,"]
+    full.workspace.steps.write_text("\n".join(lines) + "\n")
+    words = (
+        "by the verified matches that it had before the stage consistency dropped some; the column Verified counts "
+        "those that are left"
+    )
+    cascaded = replace(full, settings=full.settings.model_copy(update={"cascade": load("auto", []).cascade}))
+    assert words in page_of(cascaded)
 
 
 def test_images_tell_the_views_that_the_steps_of_a_cascade_made(full):

@@ -395,7 +395,8 @@ def _pass_lines(workspace: Workspace, ids: tuple[str, str]) -> Iterator[str]:
     rows = read_csv(workspace.steps) if workspace.steps.is_file() else []
     row = next((row for row in rows if (row["image_id0"], row["image_id1"]) == ids), None)
     if row is not None:
-        yield f"steps       {row['steps']}{': ' + row['reasons'] if row['reasons'] else ''}"
+        before = " (counted before the stage consistency dropped matches)"
+        yield f"steps       {row['steps']}{': ' + row['reasons'] + before if row['reasons'] else ''}"
 
 
 def _file_lines(path: Path) -> Iterator[str]:

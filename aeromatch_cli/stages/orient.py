@@ -137,6 +137,8 @@ def run(
         frames=own_frames(_groups(record)),
     )
     report.failures = _failed_images(context, record.failed)
+    # Every image counts once.
+    report.done, report.skipped = (max(count - len(report.failures), 0) for count in (report.done, report.skipped))
     if found.stopped:
         report.failures.append((_MAPPING, found.stopped))
     context = replace(context, block=block)
