@@ -105,8 +105,8 @@ def test_image_without_keypoints(site):
 
 
 def test_no_image_has_keypoints(site):
-    for path in site.images.iterdir():
-        cv2.imwrite(str(path), np.full((HEIGHT, WIDTH), 90, np.uint8))
+    for gray, path in enumerate(site.images.iterdir(), start=90):
+        cv2.imwrite(str(path), np.full((HEIGHT, WIDTH), gray, np.uint8))
     outcome = site("run")
     assert outcome.code == 3
     assert "no pair could be verified" in outcome.facts["error"]
