@@ -13,6 +13,7 @@ from conftest import IMAGES, PAGE
 from make_images import write_image
 from read_html import shapes
 from read_inputs import read_inputs
+from safetensors.torch import load_file, save_file
 
 from aeromatch_cli import __version__
 from aeromatch_cli.blocks.camera_files import read_camera_file
@@ -81,6 +82,10 @@ def test_the_summary_names_own_weights_and_only_those(site):
     lines = site("pairs", *learned).stdout.splitlines()[:-1]
     assert [line for line in lines if "weights" in line] == [f"own weights      {own}/geodesc.safetensors"]
     assert "own weights" not in site("pairs", "--set", "extract=learned").stdout
+    # They are those that ship.
+    assert site("pairs", *learned, "--set", "match=lightglue-learned").code == 0
+    content = load_file(shipped_path("geodesc"))
+    save_file({key: -value for key, value in content.items()}, own / "geodesc.safetensors")
     refused = site("pairs", *learned, "--set", "match=lightglue-learned")
     assert refused.code == 2
     assert f"not on those of {own}/geodesc.safetensors: give match.weights" in refused.stderr
