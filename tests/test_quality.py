@@ -240,6 +240,13 @@ def test_the_setting_that_holds_a_calibration_is_named() -> None:
     assert finding.sentence.endswith("(adjust.hold holds f)")
 
 
+@pytest.mark.parametrize(("stays", "remedy"), [(True, "let the pictures find them (orient=global), and "), (False, "")])
+def test_what_is_in_use_is_no_remedy(stays: bool, remedy: str) -> None:
+    quality = judged_with(adjust={"reprojection_error_px": 2.32}, orient={"stays": stays})
+    sentence = found(quality, "reprojection error").sentence
+    assert f": poses or cameras do not fit the matches: {remedy}check --cameras and --poses" in sentence
+
+
 def test_a_shift_that_is_not_significant_is_none() -> None:
     quality = judged_with(group=flight(shift_x=[1.0, 0.5], shift_y=[0.0, 0.5], shift_z=[0.0, 0.5]))
     assert quality.verdict == "good"

@@ -116,7 +116,10 @@ def _terrain_sigma_m(
     off_m = list(position_errors_m(given, oriented).values())
     if not off_m:
         return stated_m
-    sigma_m = max(stated_m, float(np.median(off_m)) / _MEDIAN_DISTANCE)
+    known = 3 * len(off_m)
+    # The pictures were moved onto the positions, by seven numbers.
+    taken = np.sqrt(known / max(known - 7, 1))
+    sigma_m = max(stated_m, taken * float(np.median(off_m)) / _MEDIAN_DISTANCE)
     centers_m = np.array([oriented[i].center_m for i in given.keys() & oriented.keys()])
     extent_m = float(np.linalg.norm(centers_m - centers_m.mean(axis=0)))
     return sigma_m * max(1.0, flying_m / max(extent_m, 1e-9))

@@ -24,10 +24,9 @@ def reprojection_errors(evidence: QualityInput) -> Found:
     limits = _MEASURED_PX if evidence.refined else _DETECTED_PX
     found_px = error_px / evidence.reduced
     words = f"mean reprojection error {error_px:.2f} px, up to {limits[0] * evidence.reduced:.1f} px is usual"
-    remedy = (
-        "poses or cameras do not fit the matches: let the pictures find them (orient=global), and check --cameras and "
-        "--poses"
-    )
+    by_pictures = evidence.orient is not None and not evidence.orient.stays
+    first = "" if by_pictures else "let the pictures find them (orient=global), and "
+    remedy = f"poses or cameras do not fit the matches: {first}check --cameras and --poses"
     yield finding_of("reprojection error", found_px, limits, words, with_held(evidence, remedy))
 
 
