@@ -2,7 +2,7 @@
 
 Peers that are features and a matcher are verified as the presets are: what a pair has of correct matches then tells of
 both alone. By MAGSAC++ and a fundamental matrix, 1 px, as most users verify them, ALIKED with LightGlue on ground views
-had 1,294 correct matches on six pairs of lewis, where relative poses of known cameras leave VERIFIED_LEWIS.
+had 1,294 correct of 1,388 matches on six pairs of lewis; relative poses of known cameras leave 1,555 of 1,795.
 """
 
 from __future__ import annotations
