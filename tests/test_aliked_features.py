@@ -45,7 +45,7 @@ def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(4)
         tensors = ALIKED("aliked-n16").state_dict()
-    path = tmp_path_factory.mktemp("weights") / "aliked-n16rot.pth"
+    path = tmp_path_factory.mktemp("weights") / "aliked-n16.pth"
     torch.save(tensors, path)
     return path
 
@@ -54,8 +54,8 @@ def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def known(random_weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The random weights count as published, and are in the weights folder."""
     content = hashlib.sha256(random_weights.read_bytes()).hexdigest()
-    own = replace(PUBLISHED["aliked-n16rot"], sha256=content)
-    monkeypatch.setattr(published, "PUBLISHED", {**PUBLISHED, "aliked-n16rot": own})
+    own = replace(PUBLISHED["aliked-n16"], sha256=content)
+    monkeypatch.setattr(published, "PUBLISHED", {**PUBLISHED, "aliked-n16": own})
     assert add_weights(random_weights).architecture == "aliked"
 
 
@@ -122,15 +122,15 @@ def test_a_run_without_weights_ends_before_it_begins(tmp_path: Path, words: tupl
 
 def test_other_content_under_a_published_name_is_refused() -> None:
     weights_folder().mkdir(parents=True)
-    (weights_folder() / "aliked-n16rot.pth").write_bytes(b"another")
-    with pytest.raises(ConfigError, match=r"is not the aliked-n16rot\.pth that was published"):
-        published_path("aliked-n16rot")
+    (weights_folder() / "aliked-n16.pth").write_bytes(b"another")
+    with pytest.raises(ConfigError, match=r"is not the aliked-n16\.pth that was published"):
+        published_path("aliked-n16")
 
 
 @pytest.mark.usefixtures("known")
 def test_what_is_published_is_listed_with_its_terms() -> None:
     lines = manage_weights("list", None).lines
-    (line,) = [line for line in lines if line.startswith("aliked-n16rot.pth")]
+    (line,) = [line for line in lines if line.startswith("aliked-n16.pth")]
     assert line.endswith("(Zhao et al., ALIKED, IEEE TIM 72, 2023; BSD-3-Clause)")
     assert terms_of("of no published file") == ""
     assert in_packages() == ()
