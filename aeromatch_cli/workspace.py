@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -222,6 +222,12 @@ class Workspace:
         for path in (self.stage_report(stage), *paths):
             with translated_os_errors(path):
                 path.unlink(missing_ok=True)
+
+    def withdraw(self, stage: str, paths: Sequence[Path]) -> None:
+        """As `forget`, of a stage that is not asked for: where it has left none of these files, its report says so and
+        stays as it is."""
+        if any(path.exists() for path in paths):
+            self.forget(stage, paths)
 
     def create(self) -> None:
         """Make the folder and prove that it can be written; refuse one of another format version, or with links that

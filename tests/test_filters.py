@@ -110,7 +110,7 @@ def test_too_few_matches_are_not_verifiable(count, model):
     assert verdict.state == "not verifiable"
     assert verdict.keep.shape == (count,)
     assert not verdict.keep.any()
-    assert verdict.reason == f"{count} matches, 15 needed"
+    assert verdict.reason == f"{count} {'match' if count == 1 else 'matches'}, 15 needed"
 
 
 def test_points_without_a_ray_are_dropped():

@@ -71,7 +71,7 @@ def test_the_same_picture_twice(site):
     assert outcome.facts["lost"] == {later: f"a copy of {earlier}"}
     assert (site.work / "lost.csv").read_text().splitlines() == [
         "image,what,reason",
-        f"{later},not read,a copy of {earlier}",
+        f"{later},left out,a copy of {earlier}",
     ]
 
 

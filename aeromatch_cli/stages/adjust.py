@@ -49,7 +49,7 @@ def run(context: Context) -> StageReport:
     if context.settings.first_pass is None:
         report.items = 0
         report.result = AdjustResult(images=0)
-        _remove(context)
+        context.workspace.withdraw("adjust", _files(context))
         return report.write(context.workspace)
     context, without_results = BlockState.of(context).with_current_pairs()
     report.fingerprint = _fingerprint(context)
@@ -152,10 +152,12 @@ def _fingerprint(context: Context) -> str:
     return fingerprint(how, BlockState.of(context).inputs_fingerprint("adjust"), sorted(poses.items()), known, control)
 
 
+def _files(context: Context) -> list[Path]:
+    return [context.workspace.orientation / name for name in ("adjusted.npz", "orientation.csv", "residuals.csv")]
+
+
 def _remove(context: Context) -> None:
-    folder = context.workspace.orientation
-    names = ("adjusted.npz", "orientation.csv", "residuals.csv")
-    context.workspace.forget("adjust", [folder / name for name in names])
+    context.workspace.forget("adjust", _files(context))
     context.workspace.forget("consistency", [context.workspace.final])  # which is of this adjustment
 
 

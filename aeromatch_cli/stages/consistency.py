@@ -48,7 +48,7 @@ def run(context: Context) -> StageReport:
     if adjusted is None or recipe is None:
         words = f"not done: match {context.settings.match.name} measures points without keypoints"
         report.result = ConsistencyResult(remark=words if context.settings.match.reads_pixels else "")
-        context.workspace.forget("consistency", [path, context.workspace.final])
+        context.workspace.withdraw("consistency", [path, context.workspace.final])
         return report.write(context.workspace)
     report.items = len(context.pairs)
     report.fingerprint = fingerprint(
