@@ -186,7 +186,7 @@ def stage_command(name: str) -> Callable[..., None]:
         block |= {"pose_format": pose_format, "masks": masks, "max_size_px": max_size}
         block |= {"exclude": ",".join(exclude) if exclude else None}
         block |= {"gcp": gcp, "gcp_marks": gcp_marks, "gcp_use": gcp_use}
-        run = {"jobs": jobs, "memory": memory, "executor": executor, "keep_images": keep_images or None}
+        run: dict[str, Any] = {"jobs": jobs, "memory": memory, "keep_images": keep_images or None}
         run |= {"scheduler": scheduler, "executor": executor or ("dask" if scheduler else None)}
 
         def call() -> Result:

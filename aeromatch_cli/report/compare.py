@@ -16,7 +16,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.report.rows import present_evaluation, seconds_by_stage
 from aeromatch_cli.results.stages import AdjustResult, BlockResults
-from aeromatch_cli.stages.quality import quality_on_file, results_of
+from aeromatch_cli.stages.quality import quality_of, results_of
 from aeromatch_cli.stages.settings_diff import said_value
 from aeromatch_cli.store.opened import OpenedBlock
 from aeromatch_cli.words import MANY, form, listed
@@ -277,13 +277,14 @@ def _number(value: float) -> str:
 def _side(root: Path) -> _Side:
     block = OpenedBlock(root)
     workspace = block.workspace
-    quality = quality_on_file(workspace, block.names)
+    results = results_of(workspace)
+    quality = quality_of(results, block.names)
     return _Side(
         settings=load(str(workspace.config)).model_dump(mode="json"),
         images={image.name: image for image in block.images.values()},
         matches={(block.names[p.image_id0], block.names[p.image_id1]): _final_matches(block, p) for p in block.pairs},
         seconds=seconds_by_stage(workspace),
-        results=results_of(workspace),
+        results=results,
         oriented=_oriented(workspace),
         verdict=None if quality is None else quality.verdict,
         judged=_judged(workspace),

@@ -246,11 +246,15 @@ def evaluation_figures(workspace: Workspace) -> EvaluationFigures | None:
         coded = base64.b64encode(path.read_bytes()).decode("ascii")
         pictures.append((path.stem.replace("_", " "), f"data:image/png;base64,{coded}"))
     summary = [(str(name), str(value)) for name, value in read_json(stated)["summary"]]
-    return EvaluationFigures(summary, pictures, outdated=present_evaluation(workspace) is None)
+    return EvaluationFigures(summary, pictures, _is_outdated(workspace, stated))
 
 
 def present_evaluation(workspace: Workspace) -> dict[str, Any] | None:
     """What evaluation.json holds; None where the workspace was not evaluated since its matches were made."""
     stated = workspace.evaluation / "evaluation.json"
-    outdated = not stated.is_file() or workspace.ran_since(stated, "filter", "consistency")
-    return None if outdated else dict(read_json(stated))
+    return None if not stated.is_file() or _is_outdated(workspace, stated) else dict(read_json(stated))
+
+
+def _is_outdated(workspace: Workspace, stated: Path) -> bool:
+    """Whether matches were made since evaluation.json was written."""
+    return workspace.ran_since(stated, "filter", "consistency")

@@ -9,7 +9,8 @@ from pydantic import Field
 from aeromatch_cli.results.adjustment import Control, GroupResult, PlacementKind, PoseResiduals
 from aeromatch_cli.results.record import Record
 
-# Images with fewer points that three images see are held by their neighbours one by one.
+# Images with fewer points that three images see are held by their neighbours one by one; pairs that share fewer tie no
+# parts.
 FEW_POINTS = 20
 UNREAD = "Images whose pictures could not be read; the other lists, and the groups, are without them."
 

@@ -35,7 +35,7 @@ _COMMON = 0.5
 _DOUBTFUL = 5.0
 # A stated standard deviation counts as much as so many residuals, from which it is estimated once more.
 _STATED_RESIDUALS = 3.0
-_UNKNOWNS = 7  # of a similarity
+SIMILARITY_UNKNOWNS = 7
 # Delays of positions that are tried, seconds, so many to either side; one is taken that leaves this share of what they
 # are off by.
 _MOST_DELAY_S, _DELAYS, _DELAY_BETTER = 2.0, 80, 0.3
@@ -227,7 +227,7 @@ def delay_s(centers: FloatArray, positions_m: FloatArray, velocities_m_s: FloatA
     (N, 3) of the aircraft, zero where they are not known.
     """
     known = np.isfinite(positions_m).all(axis=1) & (np.abs(velocities_m_s).sum(axis=1) > 0.0)
-    if known.sum() <= _UNKNOWNS:
+    if known.sum() <= SIMILARITY_UNKNOWNS:
         return 0.0
     own, given_m, moved_m_s = centers[known], positions_m[known], velocities_m_s[known]
 
@@ -348,7 +348,7 @@ def _level(centers: FloatArray, points: FloatArray, known: BoolArray, vertical: 
 
 def _sigma_m(found: Placement, errors_m: FloatArray, used_m: FloatArray, stated_m: float) -> float:
     """Standard deviation of the positions used (N, 3), as stated and by what they are off the model (N, 3)."""
-    spare = max(errors_m.size - _UNKNOWNS, 0)  # so many errors are seen, the others are in the fit
+    spare = max(errors_m.size - SIMILARITY_UNKNOWNS, 0)  # so many errors are seen, the others are in the fit
     squares = _STATED_RESIDUALS * stated_m**2 + float((errors_m**2).sum())
     sigma_m = float(np.sqrt(squares / (_STATED_RESIDUALS + spare)))
     shared = not found.trusted and _common(errors_m, used_m) > _COMMON

@@ -72,8 +72,8 @@ class Contradictions:
 
     masks: of every pair, which matches (M,) do, or are not likely to be right. by_distance: number of those that do.
     doubtful: image ids whose adjusted poses too many of their matches contradict: there the block is wrong, and none of
-    their matches counts as contradicting. expected_right: the share
-    of the matches left that is right to 3 pixels, by their probabilities; None where the block judges none.
+    their matches counts as contradicting. expected_right: the share of the matches left that is right to 3 pixels, by
+    their probabilities; None where the block judges none.
     """
 
     masks: list[BoolArray]

@@ -16,6 +16,7 @@ from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.results.stages import OrientResult
 from aeromatch_cli.sfm.dem import Terrain
 from aeromatch_cli.sfm.epipolar_agreement import heights_above_m, position_errors_m
+from aeromatch_cli.sfm.georeferencing import SIMILARITY_UNKNOWNS
 from aeromatch_cli.sfm.heights import height_remedy, zeros_words
 from aeromatch_cli.stages.context import Context
 
@@ -113,14 +114,14 @@ def _terrain_sigma_m(
 ) -> float:
     """Return how exactly positions tell the height of the terrain of the pictures: as they are stated, or as they fit
     these where that is worse. What they are off by changes the scale, and that the flying height."""
-    off_m = list(position_errors_m(given, oriented).values())
+    off_m = position_errors_m(given, oriented)
     if not off_m:
         return stated_m
     known = 3 * len(off_m)
-    # The pictures were moved onto the positions, by seven numbers.
-    taken = np.sqrt(known / max(known - 7, 1))
-    sigma_m = max(stated_m, taken * float(np.median(off_m)) / _MEDIAN_DISTANCE)
-    centers_m = np.array([oriented[i].center_m for i in given.keys() & oriented.keys()])
+    # The pictures were moved onto the positions, which takes that many numbers.
+    taken = np.sqrt(known / max(known - SIMILARITY_UNKNOWNS, 1))
+    sigma_m = max(stated_m, taken * float(np.median([*off_m.values()])) / _MEDIAN_DISTANCE)
+    centers_m = np.array([oriented[i].center_m for i in off_m])
     extent_m = float(np.linalg.norm(centers_m - centers_m.mean(axis=0)))
     return sigma_m * max(1.0, flying_m / max(extent_m, 1e-9))
 

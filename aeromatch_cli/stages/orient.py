@@ -111,9 +111,8 @@ def run(
     report.record_files(context, _files(context, record))
     folder = context.workspace.orientation
     found = record.result
-    ground, source, ground_remarks = judged_ground(
-        context, _terrains(context, record), found, read_poses(folder / "poses.csv")
-    )
+    poses = read_poses(folder / "poses.csv")
+    ground, source, ground_remarks = judged_ground(context, _terrains(context, record), found, poses)
     remarks = [*found.remarks, *frame_remarks(found, _groups(record)), *ground_remarks]
     remarks += judged_altitudes(ground, context.block, found, altitudes)
     report.result = found.model_copy(update={"remarks": remarks})
@@ -127,7 +126,7 @@ def run(
     block = replace(
         context.block,
         cameras=read_cameras(folder / "cameras.csv"),
-        poses=read_poses(folder / "poses.csv"),
+        poses=poses,
         ground=ground,
         ground_source=source,
         tied=tuple(record.tied),
