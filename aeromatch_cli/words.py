@@ -13,6 +13,11 @@ def form(count: int, one: str, several: str = "") -> str:
     return one if count == 1 else several or f"{one}s"
 
 
+def counted(count: int, one: str, several: str = "") -> str:
+    """A count and what it counts: `1 pair`, `2,000 matches`."""
+    return f"{count:,} {form(count, one, several)}"
+
+
 def listed(names: Iterable[object], shown: int = _NAMED, between: str = ", ") -> str:
     """The first names and how many more there are: `a, b and 3 more`.
 

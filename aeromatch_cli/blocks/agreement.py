@@ -16,7 +16,7 @@ from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.observations import Observation
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # A camera's GPS without correction, and a pose list in another datum, are off by no more.
 _SAME_M = 100.0
@@ -62,7 +62,7 @@ def agreed(
         remark = f"{source}: {both} are exchanged, as the GPS of the images shows: they were put right"
         return _exchanged(observations), [remark]
     away_km = _median_m(listed, places, to_metres) / 1000.0
-    remark = f"{source} and the GPS of {len(names)} {form(len(names), 'image')} are {away_km:,.1f} km apart"
+    remark = f"{source} and the GPS of {counted(len(names), 'image')} are {away_km:,.1f} km apart"
     zone = _fitting_zone(listed, gps) if grid else None
     if zone:
         return found, [f"{remark}: x and y fit {zone}; give --crs {zone}"]

@@ -32,7 +32,7 @@ from aeromatch_cli.blocks.pose_files.geodesy import unit_remarks
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.words import form, listed
+from aeromatch_cli.words import counted, form, listed
 
 ControlUse = Literal["adjust", "check"]
 
@@ -87,7 +87,7 @@ def read_control(
             f"{count} {form(len(unseen), 'is', 'are')} measured in no image of the block: left out: {listed(unseen)}"
         )
     if measured:
-        what = f"{len(measured)} {form(len(measured), 'point')} without coordinates"
+        what = f"{counted(len(measured), 'point')} without coordinates"
         remarks.append(f"{survey.measured_in.name} measures {what} in images: left out: {listed(measured)}")
     surveyed = [point.position[2] for point in survey.points]
     if len(surveyed) >= _ZEROS and not any(surveyed):
@@ -258,7 +258,7 @@ def _remarks_on_marks(path: Path, absent: Sequence[str], twice: list[str]) -> li
     """Return what is said of measurements in images that the block does not have, and of repeated ones."""
     remarks = []
     if absent:
-        count = f"{len(absent)} {form(len(absent), 'image')}"
+        count = counted(len(absent), "image")
         remarks.append(f"{path.name} names {count} that the block does not have: {listed(sorted(absent))}")
     if twice:
         remarks.append(f"{path.name} measures points twice in an image: the first counts: {listed(twice)}")

@@ -18,7 +18,7 @@ from aeromatch_cli.geometry.footprints import (
 )
 from aeromatch_cli.geometry.places import place_labels
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, from_yaw_pitch_roll, rotation_z
-from aeromatch_cli.words import form, listed
+from aeromatch_cli.words import counted, listed
 
 # Image names (N,) as an array, so that masks select them.
 Names = NDArray[np.object_]
@@ -195,4 +195,4 @@ def _all_zero(rotations: Sequence[FloatArray]) -> bool:
 
 def _some(names: Sequence[str] | Names) -> str:
     """How many images, and the first of them by name."""
-    return f"{len(names):,} {form(len(names), 'image')} ({listed(names)})"
+    return f"{counted(len(names), 'image')} ({listed(names)})"

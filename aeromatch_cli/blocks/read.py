@@ -54,7 +54,7 @@ from aeromatch_cli.blocks.sorties import captures_of, flights, velocities
 from aeromatch_cli.data import Camera, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.words import form, listed, of_images
+from aeromatch_cli.words import counted, form, listed, of_images
 
 EXIF = "exif"
 FOLDER = "folder"
@@ -574,5 +574,5 @@ def _relative_ground(poses: Mapping[str, Pose], facts: Mapping[str, ExifFacts]) 
         if name in poses and (relative_m := fact.relative_altitude_m) is not None
     ]
     if heights_m:
-        return float(np.median(heights_m)), f"XMP relative altitude of {len(heights_m)} {form(len(heights_m), 'image')}"
+        return float(np.median(heights_m)), f"XMP relative altitude of {counted(len(heights_m), 'image')}"
     return None, ""

@@ -15,7 +15,7 @@ from aeromatch_cli.data import Block, FloatArray, Pair
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.geometry.frames import length_words
 from aeromatch_cli.geometry.rotations import tilt_deg
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class BlockSummary:
         """What a block brings before it is oriented."""
         return [
             f"images           {self.images}, {self.positioned} with position, {self.oriented} with attitude, "
-            f"{self.cameras} {form(self.cameras, 'camera')}",
+            f"{counted(self.cameras, 'camera')}",
             f"world            {self.crs}, origin {self.origin_m[0]:.0f} {self.origin_m[1]:.0f} {self.origin_m[2]:.0f}",
         ]
 

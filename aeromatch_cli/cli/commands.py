@@ -13,7 +13,7 @@ from aeromatch_cli.cli.options import Jobs, Json, LogFile, ProgressFormat, Quiet
 from aeromatch_cli.cli.output import as_texts, guarded
 from aeromatch_cli.cli.progress import ProgressKind, progress_shown
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.command_result import Result
@@ -169,7 +169,7 @@ def synth(
             lens=lens.upper(), height_m=height, sun_deg=_parse_sun(sun), texture=texture,
             readout_ms=readout_ms, speed_m_s=speed, jobs=jobs or 0, progress=progress_shown(progress, quiet=quiet),
         )  # fmt: skip
-        words = f"rendered {images} {form(images, 'image')} into {out} ({summary.seconds:.0f} s)"
+        words = f"rendered {counted(images, 'image')} into {out} ({summary.seconds:.0f} s)"
         return Result((words,), as_texts(asdict(summary)))
 
     guarded(call, "synth", quiet=quiet, as_json=json_, log_file=log_file, context=context)

@@ -20,7 +20,7 @@ from aeromatch_cli.config.load import differences_of_preset, load, preset_names
 from aeromatch_cli.config.schema import FAMILIES, Settings
 from aeromatch_cli.config.text import first_sentence, scalar
 from aeromatch_cli.errors import ConfigError, InputError
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 _PRESETS = "presets"
 # So many headers tell what the others hold.
@@ -97,7 +97,7 @@ def first_settings(images: Path, folder: Path) -> tuple[str, list[str]]:
         raise InputError(f"no image ({KINDS}) in {images}{said}")
     looked = [exif_or_reason(images / name) for name in names[:: max(1, len(names) // _LOOKED_AT)][:_LOOKED_AT]]
     facts = [fact for fact in looked if isinstance(fact, ExifFacts)]
-    found = [f"{len(names)} {form(len(names), 'image')}", *_seen(facts)]
+    found = [counted(len(names), "image"), *_seen(facts)]
     poses = _pose_files(images, names)
     control = next(_control_files(images, names), None)
     cameras = next(_camera_files(images), None)

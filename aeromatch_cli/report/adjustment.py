@@ -17,7 +17,7 @@ from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.messages import control_of, control_words
 from aeromatch_cli.stages.stage_report import result_on_file
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # Where cx and cy of cameras count from, on the page and in files.
 PRINCIPAL_POINT = "cx, cy from the corner of the first pixel, as in COLMAP"
@@ -181,10 +181,6 @@ def surveyed_rows(control: Control | None) -> list[tuple[str, ...]]:
 
 def _metres(errors_m: Sequence[float]) -> str:
     return " / ".join(f"{error:.3f}" for error in errors_m) + " m (x / y / z)"
-
-
-def counted(count: int, one: str, several: str) -> str:
-    return f"{count:,} {form(count, one, several)}"
 
 
 def camera_words(cameras: Mapping[str, Camera]) -> str:

@@ -25,7 +25,7 @@ from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.sfm.bundle.network import LENS
 from aeromatch_cli.sfm.calibration import camera_of
 from aeromatch_cli.sfm.quality.finding import WHOLE_BLOCK, part_words
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # Cells along the longer side of a picture; a mean of fewer residuals shows their noise.
 _CELLS, _FEWEST = 16, 5
@@ -84,7 +84,7 @@ def camera_sections(
                 _remaining(adjusted, camera, camera_id, own, keypoints_px),
             )
             count = calibration.images
-            words = f"{count} {form(count, 'image')}, {camera.model}, {camera.width_px} x {camera.height_px} px"
+            words = f"{counted(count, 'image')}, {camera.model}, {camera.width_px} x {camera.height_px} px"
             shown = tuple(field for field in fields if field is not None)
             rows = tuple(_rows(calibration, found.held_by))
             sections[camera_id] = CameraSection(camera_id, words, rows, shown)

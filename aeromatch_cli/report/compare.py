@@ -19,7 +19,7 @@ from aeromatch_cli.results.stages import AdjustResult, BlockResults
 from aeromatch_cli.stages.quality import quality_of, results_of
 from aeromatch_cli.stages.settings_diff import said_value
 from aeromatch_cli.store.opened import OpenedBlock
-from aeromatch_cli.words import MANY, form, listed
+from aeromatch_cli.words import MANY, counted, listed
 from aeromatch_cli.workspace import Workspace
 
 # Differences that are not chance, as a share of the larger value.
@@ -227,7 +227,7 @@ def _match_lines(one: _Side, two: _Side) -> Iterator[str]:
     both = sorted(verified[0] & verified[1])
     ratios = [two.matches[pair] / one.matches[pair] for pair in both]
     if ratios:
-        pairs_in_both = f"{len(both)} {form(len(both), 'pair')} in both"
+        pairs_in_both = f"{counted(len(both), 'pair')} in both"
         yield f"            of {pairs_in_both}: {np.median(ratios):.2f} x as many (median)"
 
 

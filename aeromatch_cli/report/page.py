@@ -30,7 +30,6 @@ from aeromatch_cli.report.adjustment import (
     adjustment_rows,
     as_adjusted,
     camera_words,
-    counted,
     final_points,
     images_aside,
     read_adjustment,
@@ -64,6 +63,7 @@ from aeromatch_cli.stages.filter import WEAK_MATCHES, connection
 from aeromatch_cli.stages.messages import settled_words
 from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.stage_report import StageReport, result_on_file
+from aeromatch_cli.words import counted
 from aeromatch_cli.workspace import Workspace
 
 # Longer tables would make a page that no browser sorts: what is left out is the best, and it is in the files.

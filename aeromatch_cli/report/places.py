@@ -10,7 +10,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray
 from aeromatch_cli.report.figures import COLOURS, histogram_axes, label_width, name_ground_axes, new_axes, svg
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted, form
 
 # Cells along the longer side of the ground, of the overlap count; and of the points, as many as their number allows.
 _FINE, _COARSE = 160, (6, 40)
@@ -170,9 +170,7 @@ def _images_figure(seen: IntArray) -> str:
     axes.set(xlabel=label, ylabel="points", xticks=range(int(numbers[0]), int(numbers[-1]) + 1))
     axes.grid(visible=False, axis="x")
     axes.yaxis.set_major_formatter("{x:,.0f}")
-    titles = [
-        f"{number} images: {count:,} {form(count, 'point')}" for number, count in zip(numbers, counts, strict=True)
-    ]
+    titles = [f"{number} images: {counted(count, 'point')}" for number, count in zip(numbers, counts, strict=True)]
     return svg(axes.figure, "images that see a point", "histogram", {"bar": titles})
 
 
@@ -192,7 +190,7 @@ def _errors_figure(errors_px: FloatArray) -> str:
     axes.grid(visible=False, axis="x")
     axes.yaxis.set_major_formatter("{x:,.0f}")
     titles = [
-        f"{low:.2f} to {high:.2f} px: {count:,} {form(count, 'point')}"
+        f"{low:.2f} to {high:.2f} px: {counted(count, 'point')}"
         for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True)
     ]
     return svg(axes.figure, "reprojection errors", "histogram", {"bar": titles})

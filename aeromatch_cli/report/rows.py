@@ -32,7 +32,7 @@ from aeromatch_cli.results.stages import (
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import result_of
 from aeromatch_cli.store.naming import item_named
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"
@@ -224,7 +224,7 @@ def _view_words(result: ViewsResult) -> Iterator[str]:
 
 def _counts(*counts: tuple[int | None, *tuple[str, ...]]) -> Iterator[str]:
     """Each with its words, of one and of several; the latter are left out where the noun alone has an s more."""
-    return (f"{count:,} {form(count, *words)}" for count, *words in counts if count)
+    return (counted(count, *words) for count, *words in counts if count)
 
 
 def failure_rows(context: Context) -> list[dict[str, str]]:

@@ -44,7 +44,7 @@ from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.stage_report import result_of, result_on_file
 from aeromatch_cli.store.matches import match_points
 from aeromatch_cli.store.opened import OpenedBlock
-from aeromatch_cli.words import form, listed
+from aeromatch_cli.words import counted, listed
 from aeromatch_cli.workspace import Workspace
 
 # Partners that are listed one by one.
@@ -157,17 +157,15 @@ def _stage_lines(workspace: Workspace) -> Iterator[str]:
         found = read_record(path, StageRecord)
         if found is None:
             continue
-        yield f"{stage:<11} {found.items} {form(found.items, 'item')}, {found.failed} failed, {seconds[stage]:.1f} s"
+        yield f"{stage:<11} {counted(found.items, 'item')}, {found.failed} failed, {seconds[stage]:.1f} s"
         match result_of(found):
             case FilterResult() as judged:
-                states = ", ".join(f"{count} {state}" for state, count in judged.pairs.items())
-                matches = judged.verified_matches
-                yield f"            {states}; {matches} verified {form(matches, 'match', 'matches')}"
+                states = ", ".join(f"{count:,} {state}" for state, count in judged.pairs.items())
+                yield f"            {states}; {counted(judged.verified_matches, 'verified match', 'verified matches')}"
             case ConsistencyResult(verified_matches=int(left)) as final:
                 when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
-                pairs = form(final.rejected_pairs, "pair")
-                dropped = f"{final.dropped_matches} of them dropped, {final.rejected_pairs} {pairs} rejected"
-                yield f"            {dropped}; {left} {form(left, 'is', 'are')} left{when}"
+                dropped = f"{final.dropped_matches:,} of them dropped, {counted(final.rejected_pairs, 'pair')} rejected"
+                yield f"            {dropped}; {counted(left, 'is', 'are')} left{when}"
 
 
 def _export_lines(workspace: Workspace) -> Iterator[str]:
@@ -264,7 +262,7 @@ class _Partner(NamedTuple):
     @property
     def words(self) -> str:
         share = "overlap unknown" if np.isnan(self.overlap) else f"overlap {100 * self.overlap:.0f} %"
-        return f"{self.name}: {self.matches} {form(self.matches, 'match', 'matches')}, {self.state}, {share}"
+        return f"{self.name}: {counted(self.matches, 'match', 'matches')}, {self.state}, {share}"
 
 
 def _partners(work: _Work, image_id: str, keypoints: int) -> tuple[list[_Partner], BoolArray]:
@@ -411,7 +409,7 @@ def _file_lines(path: Path) -> Iterator[str]:
         yield from json.dumps(_stated(path), indent=2, ensure_ascii=False).splitlines()
     elif suffix == ".csv":
         rows = read_csv(path)
-        yield f"{len(rows)} {form(len(rows), 'row')}"
+        yield counted(len(rows), "row")
         for name in rows[0] if rows else ():
             values = Counter(row[name] for row in rows)
             often = ", ".join(f"{value or 'empty'} ({count})" for value, count in values.most_common(3))

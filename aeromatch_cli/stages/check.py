@@ -33,7 +33,7 @@ from aeromatch_cli.stages.timing import (
     try_image,
 )
 from aeromatch_cli.strategies.orienters import FirstPass
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # Of what the stages write, measured on blocks of 8 and 9 images of 0.75 megapixels. A match is written before and after
 # verification, and with a cascade once more by its step.
@@ -253,7 +253,7 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
     needed = "unknown (the sample could not be read)" if seconds is None else f"about {duration(seconds)}"
     further_s, names = estimate["seconds_of_further_steps"], " and ".join(s.name for s in context.settings.cascade)
     orient_s = estimate["seconds_to_orient"] or 0.0
-    workers = f"{context.executor.jobs} {form(context.executor.jobs, 'job')}"
+    workers = counted(context.executor.jobs, "job")
     orienting = (
         f"orient    about {duration(orient_s)} of that, more where the first pass is poor; pairs above are those of "
         "the poses as they are given"

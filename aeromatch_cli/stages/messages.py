@@ -22,7 +22,7 @@ from aeromatch_cli.sfm.mapping import Group
 from aeromatch_cli.sfm.quality.finding import MANY_WRONG_POSITIONS, guess_words
 from aeromatch_cli.stages.filter import WEAK_MATCHES
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.words import MANY, form, listed
+from aeromatch_cli.words import MANY, counted, form, listed
 
 # What a control figure is of, in words.
 _CHECKED = {"check points": "check points", "leave one out": "each control point, fitted without it"}
@@ -54,7 +54,7 @@ def _found(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[
         case MatchResult() as found:
             words = settled_words(found)
         case RefineResult(keypoints=keypoints, measured=measured, shift_px=float(shift_px)):
-            words = f"{measured} of {keypoints} keypoints measured by least squares, by {shift_px:.2f} px (median)"
+            words = f"{measured:,} of {keypoints:,} keypoints measured by least squares, by {shift_px:.2f} px (median)"
         case _:
             words = ""
     return [words] if words else []
@@ -67,12 +67,12 @@ def _views_words(found: ViewsResult) -> Iterator[str]:
         yield f"views per image: {views:.3g}, {megapixels:.3g} megapixels together"
     if isinstance(found, ExtractResult):
         if empty := found.images_without_keypoints:
-            yield f"{empty} {form(empty, 'image')} without keypoints"
+            yield f"{counted(empty, 'image')} without keypoints"
         yield from _skipped_words(found.images_skipped_same_illumination)
 
 
 def _skipped_words(count: int | None) -> list[str]:
-    return [f"{count} {form(count, 'image')} not enhanced (skipped: same illumination)"] if count else []
+    return [f"{counted(count, 'image')} not enhanced (skipped: same illumination)"] if count else []
 
 
 def settled_words(found: MatchResult) -> str:
@@ -82,16 +82,16 @@ def settled_words(found: MatchResult) -> str:
     by, lacking = found.settled_by, found.not_settled
     whole = sum(by.values()) + lacking
     (first, count), *further = by.items()
-    words = f"{count} of {whole} {form(whole, 'pair')} {form(count, 'has', 'have')} enough matches after step {first}"
-    words += "".join(f", {more} more after {name}" for name, more in further)
+    words = f"{count:,} of {counted(whole, 'pair')} {form(count, 'has', 'have')} enough matches after step {first}"
+    words += "".join(f", {more:,} more after {name}" for name, more in further)
     fewer = f"{form(lacking, 'has', 'have')} fewer matches, or less of the overlap covered, than the last step asks for"
-    return f"{words}; {lacking} {fewer}" if lacking else words
+    return f"{words}; {lacking:,} {fewer}" if lacking else words
 
 
 def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) -> list[str]:
     """States of the pairs and how images are connected; of a part of the pairs (a shard) the states alone."""
-    states = ", ".join(f"{count} {state}" for state, count in found.pairs.items()) or "none"
-    lines = [f"pairs: {states}; {_matches(found.verified_matches, 'verified ')}"]
+    states = ", ".join(f"{count:,} {state}" for state, count in found.pairs.items()) or "none"
+    lines = [f"pairs: {states}; {counted(found.verified_matches, 'verified match', 'verified matches')}"]
     if part:
         return lines
     if found.unread:
@@ -187,8 +187,8 @@ def frame_remarks(found: OrientResult, groups: Sequence[Group]) -> list[str]:
         ]
     if found.frame == "own":
         return [f"{why} the result is in a frame of its own: scale, north and place are arbitrary"]
-    what = form(beside, "image is tied to no position and lies", "images are tied to no position and lie")
-    return [f"{beside} {what} beside the others: scale, north and place are arbitrary, unless final matches tie them"]
+    what = counted(beside, "image is tied to no position and lies", "images are tied to no position and lie")
+    return [f"{what} beside the others: scale, north and place are arbitrary, unless final matches tie them"]
 
 
 def _adjust_lines(found: AdjustResult, images: int, names: Mapping[str, str]) -> list[str]:
@@ -197,7 +197,7 @@ def _adjust_lines(found: AdjustResult, images: int, names: Mapping[str, str]) ->
         return found.remarks
     error_px = "unknown" if found.reprojection_error_px is None else f"{found.reprojection_error_px:.2f} px"
     words = [
-        f"{found.images} of {images} images oriented, {found.points} {form(found.points, 'point')} in "
+        f"{found.images:,} of {images:,} images oriented, {counted(found.points, 'point')} in "
         f"{found.track_length:.1f} images each, reprojection error {error_px}"
     ]
     if len(found.groups) > 1:
@@ -222,10 +222,10 @@ def _consistency_lines(found: ConsistencyResult, names: Mapping[str, str]) -> li
     if not found.dropped_matches and not found.rejected_pairs:
         return lines
     rejected, expected, left = found.rejected_pairs, found.expected_right, found.verified_matches or 0
-    pairs = f", all of {rejected} {form(rejected, 'pair')} among them" if rejected else ""
+    pairs = f", all of {counted(rejected, 'pair')} among them" if rejected else ""
     right = "" if expected is None else f", of which {100 * expected:.1f} % are expected to be right to 3 px"
     words = f"{_dropped_words(found)}{pairs}"
-    return [f"{words}; {_matches(left, 'verified ')} {form(left, 'is', 'are')} left{right}", *lines]
+    return [f"{words}; {counted(left, 'verified match is', 'verified matches are')} left{right}", *lines]
 
 
 def _dropped_words(found: ConsistencyResult) -> str:
@@ -234,17 +234,14 @@ def _dropped_words(found: ConsistencyResult) -> str:
     # Those of earlier versions do not know the share of the one and of the other.
     contradicting = dropped if found.contradicting_matches is None else found.contradicting_matches
     unlikely = dropped - contradicting
+    words = f"dropped {counted(dropped, 'match', 'matches')}"
     contradict = form(contradicting, "contradicts", "contradict")
     likely = f"{form(unlikely, 'is', 'are')} not likely to be right"
     if not unlikely:
-        return f"dropped {_matches(dropped)} that {contradict} the adjusted block"
+        return f"{words} that {contradict} the adjusted block"
     if not contradicting:
-        return f"dropped {_matches(dropped)} that {likely}"
-    return f"dropped {_matches(dropped)}: {contradicting} {contradict} the adjusted block, {unlikely} {likely}"
-
-
-def _matches(count: int, kind: str = "") -> str:
-    return f"{count} {kind}{form(count, 'match', 'matches')}"
+        return f"{words} that {likely}"
+    return f"{words}: {contradicting:,} {contradict} the adjusted block, {unlikely:,} {likely}"
 
 
 def _final_lines(found: ConsistencyResult) -> Iterator[str]:
@@ -252,15 +249,15 @@ def _final_lines(found: ConsistencyResult) -> Iterator[str]:
     if found.points_left:
         length, error_px = found.observations_left / found.points_left, found.reprojection_error_px
         error = "" if error_px is None else f", reprojection error {error_px:.2f} px"
-        yield f"{found.points_left} of {found.points} points are left, in {length:.1f} images each{error}"
+        yield f"{found.points_left:,} of {found.points:,} points are left, in {length:.1f} images each{error}"
     spread = found.spread.values()
     held, empty = sum(parts.held for parts in spread), sum(parts.empty for parts in spread)
     many = sorted(parts.points for parts in spread)[len(spread) // 2]
     have = form(empty, "has", "have")
-    lacking = f", and {empty} {have} none though other images show the same ground" if empty else ""
+    lacking = f", and {empty:,} {have} none though other images show the same ground" if empty else ""
     yield (
-        f"{held} of {9 * len(spread)} parts of images (3 x 3 each) have points{lacking}; "
-        f"an image has {many} points that three or more images see (median)"
+        f"{held:,} of {9 * len(spread):,} parts of images (3 x 3 each) have points{lacking}; "
+        f"an image has {many:,} points that three or more images see (median)"
     )
 
 
@@ -274,10 +271,7 @@ def control_words(control: Control | None, adjusted: Sequence[ControlInGroup] = 
     every group."""
     if control is None:
         return []
-    counts = (
-        f"control: {control.control} control {form(control.control, 'point')}, "
-        f"{control.check} check {form(control.check, 'point')}"
-    )
+    counts = f"control: {counted(control.control, 'control point')}, {counted(control.check, 'check point')}"
     if control.points and len(control.not_measured_in_two_images) == control.points:
         return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
     apart = control.rays_do_not_meet
@@ -320,7 +314,7 @@ def _adjusted_words(control: ControlInGroup) -> Iterator[str]:
     if control.kept and not control.used:
         yield f"the block as it is: RMSE at check points {_axes(with_m)} m" if with_m else "no check points"
     elif control.kept:
-        used = len(control.used)
-        yield f"{used} control {form(used, 'point takes', 'points take')} part in the adjustment{errors}"
+        used = counted(len(control.used), "control point takes", "control points take")
+        yield f"{used} part in the adjustment{errors}"
     else:
         yield f"the control points were left out of the adjustment, since they make it no better{errors}"

@@ -13,7 +13,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.simulate import degenerate_view
 from aeromatch_cli.stages.stage_report import gather_failures
 from aeromatch_cli.stages.state import BlockState
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
@@ -49,7 +49,7 @@ def unregistered_reasons(
             reasons[image_id] = f"no features: {unread[image_id]}"
         elif count <= _FEW_KEYPOINTS * usual and not context.settings.match.reads_pixels:
             seen = degenerate_view(context.workspace, context.image_by_id[image_id]) or "no texture, or blurred"
-            reasons[image_id] = f"{count} {form(count, 'keypoint')}, the median is {usual:.0f}: {seen}"
+            reasons[image_id] = f"{counted(count, 'keypoint')}, the median is {usual:.0f}: {seen}"
         elif not pairs[image_id] and failed[image_id]:
             reasons[image_id] = f"{_none_of(failed[image_id])} be matched and verified: see failures.csv"
         elif not pairs[image_id]:
@@ -57,14 +57,14 @@ def unregistered_reasons(
         elif not verified[image_id]:
             reasons[image_id] = f"{_none_of(pairs[image_id])} be verified"
         elif not adjusted.poses:
-            pairs_words = f"{verified[image_id]} verified {form(verified[image_id], 'pair')}"
+            pairs_words = counted(verified[image_id], "verified pair")
             reasons[image_id] = stopped or f"no image could be oriented ({pairs_words} of this one)"
         elif verified[image_id] == 1 and not tied[image_id]:
             reasons[image_id] = "its only verified pair is with an image that is not oriented either"
         elif not tied[image_id]:
             reasons[image_id] = f"its {verified[image_id]} verified pairs are with images that are not oriented either"
         else:
-            pairs_words = f"{tied[image_id]} verified {form(tied[image_id], 'pair')}"
+            pairs_words = counted(tied[image_id], "verified pair")
             reasons[image_id] = f"too few points in common with oriented images ({pairs_words})"
     return reasons
 

@@ -25,7 +25,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.state import BlockState
 from aeromatch_cli.stages.timing import TriedPair, adjusting_s, duration, mean, measuring_s, page_s, tried_pair
 from aeromatch_cli.strategies.refiners import REFINERS
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _PART = r"(\d+(?:\.\d+)?)\s*(s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?)"
@@ -250,7 +250,7 @@ def steps_in_time(context: Context, deadline: Deadline) -> list[StepContext]:
             if not _fits(step, done[0], deadline):
                 # Each step has a limit of its own, and pairs are settled that have what the last one asks for.
                 limit = f"by its limit (below_matches {every[count - 1].below_matches})"
-                asking = f"{len(step.reasons)} {form(len(step.reasons), 'pair')}"
+                asking = counted(len(step.reasons), "pair")
                 deadline.left_out.append(f"{_STEP}{step.name}, which {asking} would have taken {limit}")
                 deadline.left_out += [f"{_STEP}{other.name}" for other in every[count:]]
                 break

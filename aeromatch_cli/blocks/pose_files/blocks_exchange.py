@@ -21,7 +21,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.lenses import Nearest, brown
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # Directions in OpenCV's camera axes.
 _DIRECTIONS = {"Right": (1.0, 0.0, 0.0), "Left": (-1.0, 0.0, 0.0), "Down": (0.0, 1.0, 0.0), "Up": (0.0, -1.0, 0.0)}
@@ -61,7 +61,7 @@ def read_blocks_exchange(source: Source) -> PoseList:
     crs, kind = system.crs, system.kind
     remarks = [*system.remarks]
     if unposed:
-        remarks.append(f"{source.path.name}: {unposed} {form(unposed, 'photo has', 'photos have')} no pose there")
+        remarks.append(f"{source.path.name}: {counted(unposed, 'photo has', 'photos have')} no pose there")
     words = crs or ("degrees" if kind == "geographic" else "local frame")
     remarks += cameras.remarks
     title = f"BlocksExchange, {words}"

@@ -19,7 +19,7 @@ from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.lenses import Nearest, of_colmap
 from aeromatch_cli.geometry.rotations import from_quaternion
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 _FLOAT = r"[-+0-9.eE]+"
 _IMAGE = re.compile(rf"\d+[ ,]+(?:{_FLOAT}[ ,]+){{7}}\d+[ ,]+\S.*[A-Za-z_./].*")
@@ -48,7 +48,7 @@ def read_model(source: Source) -> PoseList:
     rows = tuple(_binary_rows(images, cameras) if binary else _text_rows(images, cameras))
     if not rows:
         raise ConfigError(f"{images.path}: the model has no image")
-    known = f", {len(cameras.found)} {form(len(cameras.found), 'camera')}" if cameras.found else ""
+    known = f", {counted(len(cameras.found), 'camera')}" if cameras.found else ""
     crs, origin_m = world_beside(source)  # of a model that this program has exported
     if crs is not None:
         rows = tuple(

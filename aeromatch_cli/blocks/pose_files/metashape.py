@@ -33,7 +33,7 @@ from aeromatch_cli.geometry.ellipsoid import enu_from_geocentric
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted, form
 
 _ANGLES = (("yaw", "pitch", "roll"), ("omega", "phi", "kappa"), ("phi", "omega", "kappa"))
 _LONGEST_CODE = 20  # longer ones are WKT
@@ -85,7 +85,7 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     remarks = []
     if disabled:
         remarks.append(
-            f"{source.path.name}: {disabled} {form(disabled, 'camera is', 'cameras are')} not enabled there, but used"
+            f"{source.path.name}: {counted(disabled, 'camera is', 'cameras are')} not enabled there, but used"
         )
     if 0 < used_estimated < len(rows):
         given = len(rows) - used_estimated

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from aeromatch_cli.blocks.pose_files.source import Source, is_number
 from aeromatch_cli.blocks.poses import PoseList, read_poses
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted, form
 
 # The line that names the columns stands among the first ones.
 _LONGEST_PREAMBLE = 80
@@ -30,7 +30,7 @@ def read_report(source: Source) -> PoseList:
     found = read_poses(source.path, text="\n".join([*above, header, *source.lines[place + 1 :]]))
     first = next(line.strip() for line in source.lines if line.strip())
     remark = (
-        f"{source.path.name}: {place} {form(place, 'line')} above the one that names the columns ({first[:40]!r} ...) "
+        f"{source.path.name}: {counted(place, 'line')} above the one that names the columns ({first[:40]!r} ...) "
         f"{form(place, 'is', 'are')} passed over but for units: give the CRS with --crs"
     )
     return replace(found, warnings=(remark, *found.warnings), format="report with named columns")

@@ -24,7 +24,7 @@ from aeromatch_cli.sfm.quality.finding import (
     level_of,
     number,
 )
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # From the first row of a picture to its last: no shutter needs as long.
 _READOUT_S: Limits = (0.2, None)
@@ -152,7 +152,7 @@ def _wrongly_held(evidence: QualityInput, camera_id: str, camera: Calibration) -
 
 def _flight_lenses(camera_id: str, camera: Calibration) -> Iterator[Finding]:
     for one in camera.flights:
-        images = f"{one.images} {form(one.images, 'image')}"
+        images = counted(one.images, "image")
         shown = ", ".join(f"{name} by {one.change.get(name, 0.0):+.1f} px" for name in ("f", "cx", "cy"))
         words = (
             f"camera {camera_id} has another calibration in {flight_words(one.flight)} ({images}) than in "

@@ -17,7 +17,7 @@ from aeromatch_cli.sfm.quality.finding import (
     positions_given,
     rms,
 )
-from aeromatch_cli.words import MANY, form, listed
+from aeromatch_cli.words import MANY, counted, form, listed
 
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
@@ -168,7 +168,7 @@ def _placed_parts(evidence: QualityInput) -> Iterator[Finding]:
 def _loose_parts(images: Sequence[int]) -> Finding:
     """Say that parts which no pair ties to the others lie in frames of their own. images: of each."""
     if len(images) == 1:
-        words, them = f"1 part ({images[0]} {form(images[0], 'image')}) has a frame of its own", "it"
+        words, them = f"1 part ({counted(images[0], 'image')}) has a frame of its own", "it"
     else:
         words, them = f"{_sizes(images)} have frames of their own", "each"
     words += (

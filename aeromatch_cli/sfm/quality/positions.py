@@ -26,7 +26,7 @@ from aeromatch_cli.sfm.quality.finding import (
     positions_given,
     rms,
 )
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted, form
 
 # Root mean square of the differences from given positions, in stated standard deviations: 1 is what was promised. Wide
 # statements (5 m of GPS without a better word) are met easily, and that is good.
@@ -107,7 +107,7 @@ def flights(evidence: QualityInput) -> Found:
         stated_m = (np.inf, np.inf, np.inf) if group.positions is None else group.positions.stated_m
         for flight in group.flights:
             name, images, step_m = flight_words(flight.flight), flight.images, flight.step_m
-            of = f"{images} {form(images, 'image')}"
+            of = counted(images, "image")
             if step_m:
                 words = (
                     f"heights of {name} ({of}) lie {abs(step_m):.1f} m "

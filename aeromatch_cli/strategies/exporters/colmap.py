@@ -37,7 +37,7 @@ from aeromatch_cli.geometry.rotations import to_quaternion
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents, whole_folder
 from aeromatch_cli.strategies.exporters.solution import Solution, adjusted_poses, held, known_poses, write_world
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # Ours (pixel centre) to COLMAP's pixel frame (corner).
 _COLMAP_FROM_PX = np.array([[1.0, 0.0, COLMAP_OFFSET_PX], [0.0, 1.0, COLMAP_OFFSET_PX], [0.0, 0.0, 1.0]])
@@ -291,7 +291,7 @@ def _frame(image_ids: Iterable[str], frames: Mapping[str, int]) -> int:
 
 
 def _models_remark(models: Mapping[str, Model]) -> list[str]:
-    sizes = [f"{name} ({len(model.poses)} {form(len(model.poses), 'image')})" for name, model in models.items()]
+    sizes = [f"{name} ({counted(len(model.poses), 'image')})" for name, model in models.items()]
     if len(sizes) < 2:
         return []
     return [f"groups of images whose place beside each other is not known are models of their own: {', '.join(sizes)}"]

@@ -14,7 +14,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.strategies.exporters.contents import Colours, ExportContents, ExportSummary
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted, form
 
 _GREY = 128
 
@@ -66,7 +66,7 @@ def unplaced_remark(contents: ExportContents) -> list[str]:
     groups = len({frames[image_id] for image_id in beside})
     which = "another group" if groups == 1 else f"{groups} other groups"
     return [
-        f"{len(beside)} {form(len(beside), 'image')} of {which}, whose place beside the first is not known, "
+        f"{counted(len(beside), 'image')} of {which}, whose place beside the first is not known, "
         f"{form(len(beside), 'has', 'have')} no pose and no point here: "
         "export=colmap writes a model of each group"
     ]

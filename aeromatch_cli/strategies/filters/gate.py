@@ -13,7 +13,7 @@ from aeromatch_cli.data import BoolArray, FloatArray, Verdict
 from aeromatch_cli.geometry.epipolar import sampson_distance_px
 from aeromatch_cli.geometry.two_view import TwoView, chance_errors_px, log10_false_alarms
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.words import form
+from aeromatch_cli.words import counted
 
 # Of the threshold: the sharpest of these tests counts, since accurate matches are the less likely by chance.
 _SHARES = (1.0, 0.5, 0.25)
@@ -22,11 +22,9 @@ Distance = Callable[[FloatArray, FloatArray], FloatArray]
 
 def shortage(inliers: int, matches: int, needed: int) -> str:
     """Why so many inliers of so many matches do not verify a pair, "" if they are enough."""
-    return f"{inliers} {form(inliers, 'inlier')} of {_matches(matches)}, {needed} needed" if inliers < needed else ""
-
-
-def _matches(count: int) -> str:
-    return f"{count} {form(count, 'match', 'matches')}"
+    if inliers >= needed:
+        return ""
+    return f"{counted(inliers, 'inlier')} of {counted(matches, 'match', 'matches')}, {needed} needed"
 
 
 class Gated(Strategy):
@@ -49,7 +47,7 @@ class Gated(Strategy):
         """The verdict on a pair with fewer usable matches (M,) than min_inliers, else None."""
         if usable.sum() >= self.min_inliers:
             return None
-        reason = f"{_matches(int(usable.sum()))}, {self.min_inliers} needed"
+        reason = f"{counted(int(usable.sum()), 'match', 'matches')}, {self.min_inliers} needed"
         return Verdict(keep=np.zeros(len(usable), dtype=bool), state="not verifiable", reason=reason)
 
     def refusal(
