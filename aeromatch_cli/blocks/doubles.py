@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sized
 from pathlib import Path, PurePosixPath
 
 from aeromatch_cli.blocks.other_files import twins
-from aeromatch_cli.words import form, listed, of_images
+from aeromatch_cli.words import counted, form, listed, of_images
 
 # Files of equal size differ in their first or last bytes, or nowhere: these many are compared before whole ones.
 _EDGE_BYTES = 65_536
@@ -48,9 +48,9 @@ def remarks_on(found: Mapping[str, str], of_all: Sized) -> list[str]:
     if not found:
         return []
     pairs = [f"{name} is a copy of {first}" for name, first in found.items()]
-    what = f"{form(len(pairs), 'has', 'have')} the same contents as {form(len(pairs), 'another', 'others')}"
+    what = of_images(pairs, of_all, "has the same contents as another", "have the same contents as others")
     done = form(len(pairs), "the copy is left out and can be deleted", "the copies are left out and can be deleted")
-    return [f"{len(pairs)} of {len(of_all)} images {what} ({listed(pairs)}): {done}"]
+    return [f"{what}: {done}"]
 
 
 def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
@@ -59,8 +59,8 @@ def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
     if not pairs:
         return []
     shown = listed((" and ".join(same) for same in pairs), between="; ")
-    what = form(len(pairs), "picture is", "pictures are")
-    return [f"{len(pairs)} {what} there in two formats ({shown}): remove one of each"]
+    what = counted(len(pairs), "picture is", "pictures are")
+    return [f"{what} there in two formats ({shown}): remove one of each"]
 
 
 def thumbnails(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:

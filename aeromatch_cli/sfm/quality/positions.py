@@ -7,9 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.results.adjustment import (
-    FlightOffset,
-)
+from aeromatch_cli.results.adjustment import FlightOffset, PositionResiduals
 from aeromatch_cli.sfm.heights import shift_to_control_m
 from aeromatch_cli.sfm.quality.calibration import with_held
 from aeromatch_cli.sfm.quality.finding import (
@@ -53,29 +51,38 @@ def positions(evidence: QualityInput) -> Found:
         if not positions_given(evidence):
             yield "positions: none are given"
         return
+    guess = guess_words(evidence.adjust.guessed_cameras)
+    yield _wrong(evidence, found, guess)
+    yield from _met(evidence, found, guess)
+
+
+def _wrong(evidence: QualityInput, found: Sequence[PositionResiduals], guess: str) -> Finding:
+    """Whether positions contradict the pictures. guess: said of a guessed focal length, "" where none is."""
     images = sum(one.images for one in found)
     wrong = [i for one in found for i in one.wrong]
-    guess = guess_words(evidence.adjust.guessed_cameras)
+    if not wrong and not any(one.used for one in found):
+        words = (
+            f"{counted(images, 'given position is', 'given positions are')} too few to take part in the adjustment, "
+            "which takes three: scale, north and place are those of the given poses"
+        )
+        return Finding("wrong positions", 0.0, WRONG_POSITIONS[0], "good", words)
     if wrong and evidence.adjust.images == 2:
         words = (
             f"{len(wrong)} of {images} given positions {form(len(wrong), 'is', 'are')} not used: with the angles and "
             "the focal length they do not fit the pictures, and a single pair does not tell which of these is wrong"
         )
         said = f"{words}; {guess or 'a third image that overlaps both, or control points, tell'}"
-        yield Finding("wrong positions", len(wrong) / images, WRONG_POSITIONS[0], "doubtful", said)
-    elif not wrong and not any(one.used for one in found):
-        words = (
-            f"{images} given {form(images, 'position is', 'positions are')} too few to take part in the adjustment, "
-            "which takes three: scale, north and place are those of the given poses"
-        )
-        yield Finding("wrong positions", 0.0, WRONG_POSITIONS[0], "good", words)
-    else:
-        verbs = ("contradicts", "is") if len(wrong) == 1 else ("contradict", "are")
-        words = f"{len(wrong)} of {images} given positions {verbs[0]} the pictures and {verbs[1]} not used"
-        remedy = f"{evidence.named(wrong)}; check which position belongs to which image"
-        if guess and len(wrong) > MANY_WRONG_POSITIONS * images:  # single ones are wrong by themselves
-            remedy = f"{evidence.named(wrong)}; {guess}; otherwise check which position belongs to which image"
-        yield finding_of("wrong positions", len(wrong) / images, WRONG_POSITIONS, words, remedy)
+        return Finding("wrong positions", len(wrong) / images, WRONG_POSITIONS[0], "doubtful", said)
+    verbs = ("contradicts", "is") if len(wrong) == 1 else ("contradict", "are")
+    words = f"{len(wrong)} of {images} given positions {verbs[0]} the pictures and {verbs[1]} not used"
+    remedy = f"{evidence.named(wrong)}; check which position belongs to which image"
+    if guess and len(wrong) > MANY_WRONG_POSITIONS * images:  # single ones are wrong by themselves
+        remedy = f"{evidence.named(wrong)}; {guess}; otherwise check which position belongs to which image"
+    return finding_of("wrong positions", len(wrong) / images, WRONG_POSITIONS, words, remedy)
+
+
+def _met(evidence: QualityInput, found: Sequence[PositionResiduals], guess: str) -> Found:
+    """How well the adjustment meets the given positions, in units of what is stated."""
     met = [(one.rms_sigmas, one.rms_m, one.stated_m) for one in found if one.rms_sigmas and one.rms_m]
     if not met:
         return
