@@ -79,14 +79,16 @@ class AlikedNetwork:
         if missing := sorted(name for name in _LAYERS if f"{name}.weight" not in tensors):
             raise ConfigError(f"these are no weights of ALIKED: {missing[0]}.weight is missing")
         self.tensors = dict(tensors)
-        self.wide = [_folded(tensors, f"block1.conv{n}", f"block1.bn{n}") for n in (1, 2)]
-        self.half = [_folded(tensors, f"block2.conv{n}", f"block2.bn{n}") for n in (1, 2)]
+        self.wide = [_pixelwise(_folded(tensors, f"block1.conv{n}", f"block1.bn{n}")) for n in (1, 2)]
+        self.half = [_pixelwise(_folded(tensors, f"block2.conv{n}", f"block2.bn{n}")) for n in (1, 2)]
         self.deformed = {
             f"block{block}.{n}": _folded(tensors, f"block{block}.conv{n}.regular_conv", f"block{block}.bn{n}")
             for block in (3, 4)
             for n in (1, 2)
         }
         self.head = [_of_eight(tensors[f"score_head.{n}.weight"]) for n in (2, 4, 6)]
+        own, *self.coarse = tensors["score_head.0.weight"].split(32, dim=1)
+        self.mixed = [weight[:, :, 0, 0].T.contiguous() for weight in (tensors["conv1.weight"], own)]
         self.positions = len(tensors["desc_head.agg_weights"])
 
     @torch.inference_mode()
@@ -131,15 +133,15 @@ class AlikedNetwork:
 
     def _scores(self, full: Tensor, parts: list[Tensor]) -> Tensor:
         """(1, 1, H', W') 0-1."""
-        first = self.tensors["score_head.0.weight"].split(32, dim=1)
         size = tuple(full.shape[2:])
-        coarse = [F.conv2d(part, weight) for part, weight in zip(parts, first[1:], strict=True)]
+        coarse = [_rows(F.conv2d(part, weight)) for part, weight in zip(parts, self.coarse, strict=True)]
 
         def scored(x: Tensor, rows: slice, columns: slice) -> Tensor:
-            found = F.conv2d(F.selu_(F.conv2d(x.contiguous(), self.tensors["conv1.weight"])), first[0])
+            # Products of matrices: convolutions of 1 x 1 are many times slower.
+            mixed = F.selu_(x[0].permute(1, 2, 0) @ self.mixed[0]) @ self.mixed[1]
             for part in coarse:
-                found += _enlarged(part, size, rows, columns)
-            found = F.selu_(found)
+                mixed += _enlarged(part, size, rows, columns)
+            found = F.selu_(mixed).permute(2, 0, 1)[None]
             for weight in self.head[:-1]:
                 found = F.selu_(F.conv2d(found, weight, padding=1))
             return F.conv2d(found, self.head[-1], padding=1)[:, :1].sigmoid()
@@ -229,9 +231,16 @@ def _folded(tensors: Mapping[str, Tensor], layer: str, norm: str) -> tuple[Tenso
     ]
 
 
+def _pixelwise(layer: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """A layer for maps whose channels lie side by side: it would else be laid out anew for every piece."""
+    weight, bias = layer
+    return weight.contiguous(memory_format=torch.channels_last), bias
+
+
 def _of_eight(weight: Tensor) -> Tensor:
     """A layer of 3 x 3 with zeros for channels that it lacks: vector units take eight at a time."""
-    return F.pad(weight, (0, 0, 0, 0, 0, -weight.shape[1] % 8, 0, -len(weight) % 8))
+    filled = F.pad(weight, (0, 0, 0, 0, 0, -weight.shape[1] % 8, 0, -len(weight) % 8))
+    return filled.contiguous(memory_format=torch.channels_last)
 
 
 def _square(first: int, stop: int) -> Tensor:
@@ -282,22 +291,19 @@ def _positions(coarse: int, fine: int, pixels: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _enlarged(part: Tensor, size: tuple[int, ...], rows: slice, columns: slice) -> Tensor:
-    """(1, C, h, w) at some rows and columns of a picture of `size`."""
-    near_y, weights_y = _mixing(part.shape[2], size[0], rows)
-    near_x, weights_x = _mixing(part.shape[3], size[1], columns)
-    return weights_y @ (part[..., near_y, near_x].contiguous() @ weights_x.T)
+    """A map (h, w, C) at some rows and columns of a picture of `size`."""
+    low_y, high_y, share_y = _neighbours(part.shape[0], size[0], rows)
+    low_x, high_x, share_x = _neighbours(part.shape[1], size[1], columns)
+    first = int(low_x[0])
+    near = part[:, first : int(high_x[-1]) + 1]
+    wide = torch.lerp(near[low_y], near[high_y], share_y[:, None, None])
+    return torch.lerp(wide.index_select(1, low_x - first), wide.index_select(1, high_x - first), share_x[:, None])
 
 
-def _mixing(coarse: int, fine: int, chosen: slice) -> tuple[slice, Tensor]:
-    """Which of a coarse map's rows (or columns) chosen ones of a fine map lie between, n of them, and the weights
-    (chosen, n) with which they are mixed."""
+def _neighbours(coarse: int, fine: int, chosen: slice) -> tuple[Tensor, Tensor, Tensor]:
+    """Lower and upper pixel of a coarse map between which chosen ones of a fine map lie, and the upper one's share."""
     low, share = _positions(coarse, fine, torch.arange(chosen.start, chosen.stop, dtype=torch.float64))
-    first, stop = int(low[0]), min(int(low[-1]) + 2, coarse)
-    weights = torch.zeros(len(low), stop - first)
-    which = torch.arange(len(low))
-    weights[which, low - first] = 1.0 - share
-    weights[which, (low - first + 1).clamp(max=stop - first - 1)] += share
-    return slice(first, stop), weights
+    return low, (low + 1).clamp(max=coarse - 1), share
 
 
 def _between(part: Tensor, full: Tensor, x: Tensor, y: Tensor) -> Tensor:
