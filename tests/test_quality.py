@@ -154,6 +154,34 @@ def test_one_fault_decides_with_its_number(changes: dict[str, Any], what: str, v
         assert ": " in finding.sentence, "the remedy follows"
 
 
+@pytest.mark.parametrize(
+    ("changes", "not_tried", "words"),
+    [
+        ({}, None, "but its read-out time, tried where velocities are known, does not explain it"),
+        ({}, "orient=given", "and its read-out time was not tried: orient=given"),
+        ({"readout_s": [0.03, 0.001, 0.0, 0.03]}, None, "a part of the rolling shutter may be in it"),
+    ],
+)
+def test_the_remedy_for_affinity_says_what_was_tried_and_says_it_once(
+    changes: dict[str, Any], not_tried: str | None, words: str
+) -> None:
+    def camera(b2: float) -> dict[str, Any]:
+        return CALIBRATED | {
+            "parameters": CALIBRATED["parameters"] | {"k1": [0.0] * 4, "b2": [b2, 0.1, 0.0, 0.1]} | changes
+        }
+
+    group = {"calibration": {"camera_1": camera(0.8), "camera_2": camera(1.1), "camera_3": camera(0.2)}}
+    quality = judged_with(group=group, adjust={"readout_not_tried": not_tried})
+    doubtful, good = [one for one in quality.findings if one.what == "affinity"]
+    assert (doubtful.value, doubtful.level) == (pytest.approx(11.0), "doubtful")
+    assert doubtful.sentence.count(words) == 1
+    for known in ("camera_1: b2 0.8 ", "camera_2: b2 1.1 "):
+        assert known in doubtful.sentence
+    assert (good.value, good.level) == (pytest.approx(2.0), "good")
+    assert "camera_3: b2 0.2 " in good.sentence
+    assert "square" not in good.sentence
+
+
 def test_a_single_pair_does_not_tell_what_is_wrong() -> None:
     pair = {"images": 2, "components": [2]}
     group = {"kind": "given", "images": 2} | positions(images=2, used=0, wrong=["a", "b"], **NONE_USED)

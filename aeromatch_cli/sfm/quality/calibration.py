@@ -17,6 +17,7 @@ from aeromatch_cli.sfm.quality.finding import (
     LEVELS,
     Finding,
     Found,
+    Level,
     Limits,
     QualityInput,
     finding_of,
@@ -31,6 +32,10 @@ _READOUT_S: Limits = (0.2, None)
 # A calibration that differs so much from what is known of the camera, in standard deviations of that: a camera file of
 # another camera, pictures of another size, or positions that force it.
 _LENS_SIGMAS: Limits = (3.0, 6.0)
+# b1 and b2 of a lens that nobody has calibrated.
+_AFFINITY_SIGMAS: Limits = (_LENS_SIGMAS[0], None)
+# Parameters of a camera, and by how many standard deviations those of affinity differ from square pixels.
+_Affinity = tuple[Mapping[str, Parameter], Mapping[str, float]]
 # What a lens of its own for a flight is worth, over what is asked for: beyond, the flights do not share a calibration.
 _FLIGHT_LENS: Limits = (1.0, None)
 
@@ -38,6 +43,7 @@ _FLIGHT_LENS: Limits = (1.0, None)
 def calibration(evidence: QualityInput) -> Found:
     """The parameter of every camera that differs most from what is known of it."""
     told = set[str]()
+    affinities: dict[str, _Affinity] = {}
     for group in evidence.groups:
         for camera_id, camera in group.calibration.items():
             if camera_id in told:  # a camera is one and the same for all groups
@@ -53,12 +59,14 @@ def calibration(evidence: QualityInput) -> Found:
                 )
                 yield Finding("focal length", None, None, "doubtful", words)
             affinity = {name: changes.pop(name) for name in ({"b1", "b2"} - _stated(parameters)) & changes.keys()}
-            yield from _affinity(camera_id, parameters, affinity)
+            if affinity:
+                affinities[camera_id] = parameters, affinity
             yield from _wrongly_held(evidence, camera_id, camera)
             if changes:
                 told.add(camera_id)
                 yield from _flight_lenses(camera_id, camera)
                 yield _largest_change(evidence, group, camera_id, changes)
+    yield from _affinities(evidence, affinities)
     if not told:
         yield f"calibration: {_held_words(evidence) or 'it was not adjusted'}"
 
@@ -102,18 +110,28 @@ def _read_out(camera_id: str, parameters: Mapping[str, Parameter]) -> Iterator[F
         yield finding_of("rolling shutter", seconds if seconds > 0.0 else np.inf, _READOUT_S, words, remedy)
 
 
-def _affinity(camera_id: str, parameters: Mapping[str, Parameter], affinity: Mapping[str, float]) -> Iterator[Finding]:
-    """affinity: by how much its parameters differ from those of square pixels, in standard deviations."""
-    if affinity:
+def _affinities(evidence: QualityInput, cameras: Mapping[str, _Affinity]) -> Iterator[Finding]:
+    """Cameras with the same level and remedy share a finding, which says the remedy once."""
+    alike: dict[tuple[Level, str], list[tuple[float, str]]] = {}
+    for camera_id, (parameters, affinity) in cameras.items():
         name = max(affinity, key=lambda key: affinity[key])
-        words = _change(camera_id, name, parameters[name], affinity[name])
-        remedy = "pixels of sensors are square: " + (
-            "a part of the rolling shutter may be in it, which looks the same"
-            if _has_read_out(parameters)
-            else "a rolling shutter looks like that where images have no velocities; give capture times or a "
-            "shorter exposure"
-        )
-        yield finding_of("affinity", affinity[name], (_LENS_SIGMAS[0], None), words, remedy)
+        key = level_of(affinity[name], _AFFINITY_SIGMAS), _affinity_remedy(evidence, parameters)
+        alike.setdefault(key, []).append((affinity[name], _change(camera_id, name, parameters[name], affinity[name])))
+    for (_, remedy), found in alike.items():
+        words = "; ".join(words for _, words in found)
+        yield finding_of("affinity", max(found)[0], _AFFINITY_SIGMAS, words, remedy)
+
+
+def _affinity_remedy(evidence: QualityInput, parameters: Mapping[str, Parameter]) -> str:
+    square, not_tried = "pixels of sensors are square", evidence.adjust.readout_not_tried
+    if _has_read_out(parameters):
+        return f"{square}: a part of the rolling shutter may be in it, which looks the same"
+    if not_tried:
+        return f"{square}: a rolling shutter looks like that, and its read-out time was not tried: {not_tried}"
+    return (
+        f"{square}: a rolling shutter looks like that, but its read-out time, tried where velocities are known, does "
+        "not explain it; a calibration of the camera (--cameras FILE) tells more"
+    )
 
 
 def _held_words(evidence: QualityInput) -> str:
