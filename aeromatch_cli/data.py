@@ -232,8 +232,8 @@ class Raster(Protocol):
 
 
 class PictureQuality(NamedTuple):
-    """How sharp and well exposed a picture is. blur: 0 (sharp) to 1, NaN where nothing is seen. black, white: shares of
-    the pixels that show nothing. damage: what the decoder complains of, "" for nothing. sha256: of the
+    """How sharp and well exposed a picture is. blur: 0 (sharp) to 1 (of one value), NaN where nothing is seen. black,
+    white: shares of the pixels that show nothing. damage: what the decoder complains of, "" for nothing. sha256: of the
     file, to tell one that was only touched from one that has changed."""
 
     blur: float

@@ -111,6 +111,21 @@ def test_black_and_white_pictures_show_nothing() -> None:
     assert np.isnan(picture_quality(black, np.zeros((60, 80), dtype=bool)).blur)
 
 
+@pytest.mark.parametrize(
+    ("value", "figures", "nothing"),
+    [(0, [np.nan, 1.0, 0.0], "black"), (255, [1.0, 0.0, 1.0], "white"), (128, [1.0, 0.0, 0.0], "without texture")],
+)
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+def test_a_picture_of_one_value_shows_nothing(
+    tmp_path: Path, value: int, figures: list[float], nothing: str, suffix: str
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    cv2.imwrite(str(path), np.full((60, 80, 3), value, np.uint8))
+    quality = read_quality(path)
+    np.testing.assert_equal(quality[:3], figures)
+    assert shows_nothing(quality) == nothing
+
+
 def test_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     picture = taken(grass())

@@ -54,8 +54,9 @@ may be deleted.
 One line per image: `image_id` (unique slug of the relative path), `name` (relative path), `width_px`, `height_px`,
 `camera_id`, `exif_orientation`, `time` (ISO 8601), `fingerprint` of the file; of its picture `blur` (0 sharp to 1: the
 share of the differences of neighbouring pixels that is left after one more blur, Crete et al. 2007; sharp pictures have
-0.15 to 0.35), `black` and `white` (shares of the pixels at either end of the scale), `damage` (what the decoder
-complains of), empty where it was not measured; `sha256` of the file, by which one that was only touched is no other.
+0.15 to 0.35, one of a single value has 1, an entirely black one none), `black` and `white` (shares of the pixels at
+either end of the scale), `damage` (what the decoder complains of), empty where it was not measured; `sha256` of the
+file, by which one that was only touched is no other.
 
 ### cameras.csv
 

@@ -39,16 +39,16 @@ def read_quality(path: Path) -> PictureQuality:
 
 
 def picture_quality(gray: NDArray[Any], valid: BoolArray | None) -> PictureQuality:
-    """gray, valid: (H, W), uint8; what is not valid counts nowhere."""
+    """gray, valid: (H, W), uint8; what is not valid counts nowhere, but a picture that is nothing else is black."""
     seen = gray if valid is None else gray[valid]
-    if not seen.size:
-        return PictureQuality(float("nan"), 0.0, 0.0)
+    if not seen.size:  # frames of black are not valid, and an entirely black picture is one
+        return PictureQuality(float("nan"), 1.0, 0.0)
     counts = np.bincount(seen.ravel()[:: max(1, seen.size // 1_000_000)], minlength=256)
     black, white = counts[:_BLACK].sum() / counts.sum(), counts[_WHITE + 1 :].sum() / counts.sum()
     parts = [_blur(gray[rows, columns]) for rows, columns in _windows(gray.shape, valid)]
-    contrasts = np.array([contrast for _, contrast in parts])
-    if not len(parts) or contrasts.max() <= 0.0:
+    if not parts:
         return PictureQuality(float("nan"), float(black), float(white))
+    contrasts = np.array([contrast for _, contrast in parts])
     blurs = np.array([blur for blur, _ in parts])[contrasts >= _LEAST_CONTRAST * np.median(contrasts)]
     return PictureQuality(float(np.median(blurs)), float(black), float(white))
 
@@ -80,10 +80,12 @@ def _sigma(values: FloatArray) -> float:
 
 
 def shows_nothing(quality: PictureQuality) -> str:
-    """Return "black" or "white" of a picture that is little else, else ""."""
+    """Return "black" or "white" of a picture that is little else, "without texture" where no pixels differ, else ""."""
     if quality.black >= _NOTHING:
         return "black"
-    return "white" if quality.white >= _NOTHING else ""
+    if quality.white >= _NOTHING:
+        return "white"
+    return "without texture" if quality.blur >= 1.0 else ""
 
 
 def _windows(shape: tuple[int, ...], valid: BoolArray | None) -> list[tuple[slice, slice]]:
