@@ -394,18 +394,19 @@ def test_measured_angles_are_no_remedy_where_there_are_some() -> None:
     assert "measured angles" in found(judged_with(group=tilted, adjust={"residuals": None}), "tilt").sentence
 
 
-def test_errors_of_positions_are_those_of_the_table() -> None:
+def test_errors_of_positions_are_of_x_and_y_together_as_in_the_table_and_say_what_they_leave_out() -> None:
     # x 0.117, y 0.447, z 0.165 m: XY 0.462 m.
     off = positions(rms_m=[0.117, 0.447, 0.165], rms_sigmas=[0.0234, 0.0894, 0.033], stated_m=[5.0, 5.0, 5.0])
     quality = judged_with(group=off)
     across, up = (found(quality, f"positions {name}") for name in ("horizontally", "vertically"))
     assert across.value == pytest.approx(0.0654, abs=1e-4)  # root mean square of both axes, as before
     assert across.sentence == (
-        "positions are met horizontally to 0.462 m (root mean square in XY), 0.1 times what is stated, "
-        "5 m along each axis"
+        "positions are met horizontally to 0.462 m (root mean square in XY, without drifts, shifts and delays of "
+        "flights and antenna offsets), 0.1 times what is stated, 5 m along each axis"
     )
-    assert (
-        up.sentence == "positions are met vertically to 0.165 m (root mean square in Z), 0.0 times what is stated, 5 m"
+    assert up.sentence == (
+        "positions are met vertically to 0.165 m (root mean square in Z, without drifts, shifts and delays of "
+        "flights and antenna offsets), 0.0 times what is stated, 5 m"
     )
 
 

@@ -66,17 +66,16 @@ def residual_section(
 
 
 def _weights(groups: Sequence[GroupResult]) -> str:
-    """How the adjustment weighs positions, and whether it explains some of their residuals; of the group with most."""
+    """How the adjustment weighs positions, in the group with most, and what its own residuals leave out."""
     most = max(groups, key=lambda one: one.positions.used if one.positions else 0, default=None)
     if most is None or most.positions is None:
         return ""
     across, up = most.positions.factors
-    words = (
+    return (
         f" By what they are off the adjustment weighs them with {across:.1f} times the stated standard deviations "
-        f"horizontally and {up:.1f} times vertically."
+        f"horizontally and {up:.1f} times vertically. Unlike in the verdict, drifts, shifts and delays of flights, "
+        "antenna offsets and positions that are not used count here."
     )
-    explained = most.flights or any(mount.lever_x is not None for mount in most.mounts.values())
-    return words + (" What was found of flights and antennas is part of the residuals here." if explained else "")
 
 
 def _errors(values: FloatArray, digits: int) -> tuple[str, ...]:

@@ -98,11 +98,13 @@ def _met(evidence: QualityInput, found: Sequence[PositionResiduals], guess: str)
             float(np.sqrt(shares @ [rms(np.array(one)[of]) ** 2 for one in values]))
             for values in zip(*met, strict=True)
         )
-        # Of x and y together, as in the page's table; what is stated is stated of each.
+        # Of x and y together, as in the page's table, which leaves in what is taken out here; what is stated is stated
+        # of each.
         error_m = off_m * np.sqrt(len(of))
         words = (
-            f"positions are met {name} to {plain(error_m, 3)} m (root mean square in {axes.upper()}), "
-            f"{sigmas:.1f} times what is stated, {plain(stated_m, 3)} m{' along each axis' if len(of) > 1 else ''}"
+            f"positions are met {name} to {plain(error_m, 3)} m (root mean square in {axes.upper()}, without "
+            f"drifts, shifts and delays of flights and antenna offsets), {sigmas:.1f} times what is stated, "
+            f"{plain(stated_m, 3)} m{' along each axis' if len(of) > 1 else ''}"
         )
         yield finding_of(f"positions {name}", sigmas, _POSITION_SIGMAS, words, with_held(evidence, remedy))
 
