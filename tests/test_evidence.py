@@ -24,14 +24,18 @@ class Unforeseen(Step):
     name: str = "unforeseen"
 
 
+def _short(verified: int, enough: int, percent: int) -> str:
+    return f"{verified} verified matches of {enough} that are enough for an overlap of {percent} % of the image"
+
+
 @pytest.mark.parametrize(
     ("evidence", "reason"),
     [
         (PairStatistics(300, 0.5, 0.9, MANY), ""),
-        (PairStatistics(299, 0.5, 0.9, MANY), "299 verified matches of 300 that an overlap of 50 % promises"),
+        (PairStatistics(299, 0.5, 0.9, MANY), _short(299, 300, 50)),
         (PairStatistics(60, 0.2, 0.1, MANY), ""),
-        (PairStatistics(59, 0.2, 0.1, MANY), "59 verified matches of 60 that an overlap of 20 % promises"),
-        (PairStatistics(29, 0.01, 1.0, MANY), "29 verified matches of 30 that an overlap of 1 % promises"),
+        (PairStatistics(59, 0.2, 0.1, MANY), _short(59, 60, 20)),
+        (PairStatistics(29, 0.01, 1.0, MANY), _short(29, 30, 1)),
         (PairStatistics(900, 0.5, 0.55, MANY), "verified matches in 55 % of the overlap"),
         (PairStatistics(600, np.nan, np.nan, MANY), ""),
         (
@@ -41,7 +45,7 @@ class Unforeseen(Step):
         (PairStatistics(30, 0.0, np.nan, MANY), "30 verified matches of 600 that are enough, no overlap predicted"),
         # A quarter of 2000 keypoints, a quarter of the matches.
         (PairStatistics(75, 0.5, 0.9, 500), ""),
-        (PairStatistics(74, 0.5, 0.9, 500), "74 verified matches of 75 that an overlap of 50 % promises"),
+        (PairStatistics(74, 0.5, 0.9, 500), _short(74, 75, 50)),
     ],
 )
 def test_a_pair_goes_on_where_it_falls_short_of_its_overlap(evidence: PairStatistics, reason: str) -> None:
@@ -128,7 +132,7 @@ def test_a_pair_with_enough_takes_a_step_that_is_expected_to_bring_much_more() -
 
 def test_what_a_lacking_pair_is_expected_to_have_is_said() -> None:
     lacking = replace(USUAL, verified=100)
-    words = "100 verified matches of 360 that an overlap of 60 % promises"
+    words = _short(100, 360, 60)
     assert lacking.lacks(STEP) == words
     about = float(f"{lacking.expected(STEP, 4000):.2g}")
     assert lacking.asks_for(STEP, 4000) == f"{words}, about {about:.0f} expected after it"

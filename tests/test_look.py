@@ -101,6 +101,8 @@ def test_show_says_what_a_workspace_an_image_and_a_pair_hold(done_site: Site) ->
     pair = invoke("show", work, names[1], Path(names[0]).stem, "--rejected", "--out", work / "p.png", "--json")
     assert pair.facts["pair"] == names[:2]
     assert pair.facts["verified"] > 30
+    (share,) = [float(row["overlap"]) for row in partners if "suburb_0002_jpg" in row.values()]
+    assert f"overlap     {100 * share:.0f} % of the smaller footprint, view angle " in pair.stdout
     assert "steps" not in pair.stdout
     with Image.open(work / "p.png") as picture:
         assert picture.size == (320 + 8 + 320, 240)

@@ -209,9 +209,10 @@ that found a keypoint; `numbers_<step>` (K_step,) int32: number here of each key
 
 Only with a `cascade`. `image_id0`, `image_id1`, `steps` (those that the pair took, joined by +), `reasons` (why it took
 the further ones), `settled_by` (the step after which it needed nothing more, empty where it lacks matches in the end),
-`lacks` (what it lacks in the end), `verified` (verified matches of all steps, those that two of them have found counted
-once, before the pair is verified as a whole), `expected` (how many were expected after the last step that it took;
-empty where overlap or view angle are unknown, or nothing is known of the step). What a step makes lies
+`lacks` (what it lacks in the end; an overlap in these words is the share of an image that shows ground of the other,
+not that of the footprint as in pairs.csv), `verified` (verified matches of all steps, those that two of them have found
+counted once, before the pair is verified as a whole), `expected` (how many were expected after the last step that it
+took; empty where overlap or view angle are unknown, or nothing is known of the step). What a step makes lies
 in a folder of its name, written like the files of the block that join it: `features/<step>/`, `matches/<step>/`,
 `verified/<step>/`, `simulated/<step>/`, `enhanced/<step>/`, `reports/<step>/`. `guided` has no features: it uses those
 of the step `first`.

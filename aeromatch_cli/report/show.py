@@ -326,7 +326,8 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
         raise InputError(f"{image0.name} and {image1.name} have no matches on file: run aeromatch match and filter")
     lines = [f"pair        {image0.name} and {image1.name}, paired by {pair.reason}"]
     if not np.isnan(pair.overlap):
-        lines.append(f"overlap     {100 * pair.overlap:.0f} %, view angle {pair.view_angle_deg:.1f} degrees")
+        share = f"{100 * pair.overlap:.0f} % of the smaller footprint"
+        lines.append(f"overlap     {share}, view angle {pair.view_angle_deg:.1f} degrees")
     verdict = found.verdict
     kept = found.matches if verdict.state == "verified" else None
     count = 0 if kept is None else len(kept.indices)

@@ -80,8 +80,8 @@ class PairStatistics:
         least = self.enough(step)
         if self.verified < least:
             unknown = "no overlap predicted" if self.overlap == 0.0 else "overlap unknown"
-            by = f"that an overlap of {100 * share:.0f} % promises" if known else f"that are enough, {unknown}"
-            return f"{self.verified} verified matches of {least} {by}"
+            by = f" for an overlap of {100 * share:.0f} % of the image" if known else f", {unknown}"
+            return f"{self.verified} verified matches of {least} that are enough{by}"
         if share >= _TYING_OVERLAP and self.coverage < step.below_coverage:
             return f"verified matches in {100 * self.coverage:.0f} % of the overlap"
         return ""
