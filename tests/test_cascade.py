@@ -14,6 +14,7 @@ from conftest import IMAGES, UNORIENTED, Site
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Matches, Pair, PairGeometry, Pose, Verdict
 from aeromatch_cli.errors import ItemError
+from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.features import read_joined, read_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_verified_row
 from aeromatch_cli.geometry.coverage import CELLS, covered_share, shared_cells
@@ -141,7 +142,7 @@ def test_a_cascade_ends_in_one_result(site: Site) -> None:
     site = Site(site.root)
     settings = ("--set", "cascade=learned", "--set", "cascade.learned.below_matches=100000")
     settings += ("--set", "cascade.learned.keypoints=300")
-    outcome = site("run", *settings)
+    outcome = site("run", *settings, "--json")
     assert outcome.code == 0, outcome.stderr
     pairs = IMAGES * (IMAGES - 1) // 2
     lacking = f"{pairs} have fewer matches, or less of the overlap covered, than the last step asks for"
@@ -154,12 +155,21 @@ def test_a_cascade_ends_in_one_result(site: Site) -> None:
     assert all("verified matches of" in row["reasons"] and row["lacks"] for row in rows)
     assert all(int(row["expected"]) > 0 for row in rows)
     ids = [name.replace(".", "_") for name in site.names()]
+    features, own_keypoints = outcome.facts["stages"]["extract"]["result"], 0
     for image_id in ids:
         joined = read_joined(site.work / "features" / f"{image_id}.npz")
         for step, numbers in joined.numbers.items():
             own = read_keypoints(site.work / "features" / step / f"{image_id}.npz")[0]
+            own_keypoints += len(own)
             apart_px = np.linalg.norm(joined.keypoints_px[numbers] - own, axis=1)
             assert apart_px.max() < (1e-6 if step == "first" else 0.51)
+    assert features["images_by_step"] == {"first": IMAGES, "learned": IMAGES}
+    assert (features["images"], features["keypoints"]) == (2 * IMAGES, own_keypoints)
+    steps = [read_json(site.work / "reports" / step / "extract.json")["result"] for step in ("first", "learned")]
+    for sums in ("views", "view_megapixels"):
+        assert features[sums] == pytest.approx(sum(one[sums] for one in steps))
+    assert features["views"] >= 2 * IMAGES
+    assert "views per image: " in outcome.stdout
     both = {step: _matches(site, step) for step in ("first", "learned")}
     whole = sum(len(e.matches.indices) for e in _rows(site.work / "verified"))
     assert whole > 1.05 * max(both.values())

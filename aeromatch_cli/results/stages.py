@@ -148,7 +148,8 @@ class ViewsResult(StageResult):
 
 
 class ExtractResult(ViewsResult):
-    """Features of the images of this run."""
+    """Features of the images of this run; with a cascade images, views and keypoints summed over the last runs of its
+    steps, so that an image counts once for each step that made views of it."""
 
     stage: ClassVar[str] = "extract"
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -135,13 +136,24 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
         context.store.made_features(image_id, known)
     # An image that fails in one step has the keypoints of the others.
     report.skipped = joined - len(tasks)
-    found = result_on_file(steps[0].context.workspace, ExtractResult)
-    report.result = ExtractResult(
-        images_by_step={step.name: len(step.images) for step in steps if step.own_features},
-        images_without_keypoints=0 if found is None else found.images_without_keypoints,
-    )
+    report.result = _sums(steps)
     report.fingerprint = fingerprint(sorted(context.scope.joined.features.values()))
     return report.write(context.workspace)
+
+
+def _sums(steps: Sequence[StepContext]) -> ExtractResult:
+    """Return what the steps have on file of their features together."""
+    own = [step for step in steps if step.own_features]
+    first, *further = (result_on_file(s.context.workspace, ExtractResult) if s.images else None for s in own)
+    known = [found for found in (first, *further) if found is not None]
+    total = reduce(ExtractResult.plus, known) if known else ExtractResult()
+    return total.model_copy(
+        update={
+            # One in which a further step finds nothing is not without keypoints.
+            "images_without_keypoints": 0 if first is None else first.images_without_keypoints,
+            "images_by_step": {step.name: len(step.images) for step in own},
+        }
+    )
 
 
 def _failures(steps: Sequence[StepContext], *stages: str) -> list[tuple[str, str]]:
