@@ -1,4 +1,4 @@
-"""Positions whose columns are exchanged are told by the pictures."""
+"""Positions whose columns are exchanged, or of another sign, are told by the pictures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from test_soundness import model_of
 
 from aeromatch_cli.blocks.crs import grid_from_geographic, utm_crs
 from aeromatch_cli.data import Block, Pose
-from aeromatch_cli.stages.swapped_axes import exchanged_columns
+from aeromatch_cli.stages.swapped_axes import fitting_reading
 
 TRUTH = flight()
 ZONE = "EPSG:32633"
@@ -50,12 +50,13 @@ def exchanged_places(swap: bool) -> Block:
 def test_latitudes_in_the_place_of_longitudes_are_named() -> None:
     swapped = exchanged_places(swap=True)
     assert swapped.crs != ZONE
-    assert exchanged_columns(swapped, pictures()) == "latitude and longitude"
+    assert fitting_reading(swapped, pictures()) == "exchanged"
 
 
-def test_x_in_the_place_of_y_is_named() -> None:
-    places = {i: pose.center_m[[1, 0, 2]] for i, pose in TRUTH.items()}
-    assert exchanged_columns(block_of("local", places, (0.0, 0.0, 0.0)), pictures()) == "x and y"
+@pytest.mark.parametrize("mirror", [[[0, 1], [1, 0]], [[-1, 0], [0, 1]], [[1, 0], [0, -1]]])
+def test_x_in_the_place_of_y_or_a_wrong_sign_is_a_mirror_image(mirror: list[list[int]]) -> None:
+    places = {i: np.array([*(mirror @ pose.center_m[:2]), pose.center_m[2]]) for i, pose in TRUTH.items()}
+    assert fitting_reading(block_of("local", places, (0.0, 0.0, 0.0)), pictures()) == "mirrored"
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -63,4 +64,4 @@ def test_places_of_other_images_are_not(seed: int) -> None:
     ids = list(TRUTH)
     mixed = np.random.default_rng(seed).permutation(ids)
     places = {i: TRUTH[str(other)].center_m for i, other in zip(ids, mixed, strict=True)}
-    assert exchanged_columns(block_of("local", places, (0.0, 0.0, 0.0)), pictures()) == ""
+    assert fitting_reading(block_of("local", places, (0.0, 0.0, 0.0)), pictures()) == ""

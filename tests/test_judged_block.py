@@ -91,6 +91,7 @@ def test_positions_that_do_not_fit_leave_a_result_in_a_frame_of_its_own(site: Si
     outcome = site("run")
     assert outcome.code == 1
     assert "given positions is used, the pictures contradict them" in outcome.stdout
+    assert "given positions fit the pictures only mirrored: are x and y exchanged, or is the sign" in outcome.stderr
     assert "in a frame of its own: scale, north and place are arbitrary" in outcome.stderr
     export = site.work / "export" / "colmap"
     world = json.loads((export / "world.json").read_text())

@@ -49,6 +49,15 @@ _FOCAL_SHARE = 0.02
 _SHOWN = 0.5
 # Pictures of one place differ by less, in pixels of the stored images.
 _STANDING_PX = 2.0
+# How given positions miss the pictures, or how they would fit them, and what to do. Positions alone do not tell
+# exchanged columns from a wrong sign: either makes a mirror image.
+_MISFITS = {
+    "exchanged": "the given positions do not fit the pictures, but with latitude and longitude exchanged they do: "
+    "exchange these columns of the pose list",
+    "mirrored": "the given positions fit the pictures only mirrored: are x and y exchanged, or is the sign of x or y, "
+    "or of latitude or longitude, another?",
+    "scattered": "the given positions do not fit the pictures: are they those of other images, or of another flight?",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,12 +196,13 @@ def from_models(
     models: Sequence[Model],
     before: Before,
     angles: Mapping[str, Angles],
-    exchanged: str = "",
+    reading: str = "",
 ) -> Solution:
     """Return given poses and cameras, replaced by those of the mapper's models, the largest first.
 
     before: models are moved onto these poses, and where they agree the images keep them and their cameras. angles:
-    image_id -> attitude as it was given. exchanged: columns with whose exchange the given positions fit the pictures.
+    image_id -> attitude as it was given. reading: how given positions that contradict the pictures fit them all the
+    same, as of `_MISFITS`, "" where they do not.
     """
     block = evidence.block
     cameras, found = _of_models(block, models, before)
@@ -228,7 +238,7 @@ def from_models(
         points=points,
         focal_lengths=_focal_lengths(evidence.stated_cameras, cameras),
         outside=_outside(block, found),
-        remarks=[*_position_remarks(models, exchanged), *_convention_remarks(convention)],
+        remarks=[*_position_remarks(models, reading), *_convention_remarks(convention)],
         **_judged(block.poses, judged_poses, convention, angles, _north_by_image(models, block.poses)),
     )
     return Solution(cameras, poses, terrains, groups, result)
@@ -338,16 +348,9 @@ def _convention_remarks(convention: Recognised | None) -> list[str]:
     return [f"the given angles do not fit the pictures: {convention.words}"]
 
 
-def _position_remarks(models: Sequence[Model], exchanged: str) -> list[str]:
+def _position_remarks(models: Sequence[Model], reading: str) -> list[str]:
     contradiction = models[0].figures.contradiction if models else ""
-    said = "the given positions do not fit the pictures"
-    if not contradiction:
-        return []
-    if exchanged:
-        return [f"{said}, but with {exchanged} exchanged they do: exchange these columns of the pose list"]
-    if contradiction == "mirrored":
-        return [f"{said}, only mirrored: is the sign of x or y, or of latitude or longitude, another?"]
-    return [f"{said}: are they those of other images, or of another flight?"]
+    return [_MISFITS[reading or contradiction]] if contradiction else []
 
 
 def _judged(

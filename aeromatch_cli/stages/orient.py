@@ -40,7 +40,7 @@ from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
 from aeromatch_cli.stages.messages import frame_remarks
 from aeromatch_cli.stages.models import best_mapped, evidence_of
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
-from aeromatch_cli.stages.swapped_axes import exchanged_columns
+from aeromatch_cli.stages.swapped_axes import fitting_reading
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 
@@ -192,8 +192,8 @@ def _solution(
     else:
         mapped, tried = best_mapped(context, recipe, first, evidence)
         models, first, evidence, stopped = mapped.models, mapped.first, mapped.evidence, mapped.stopped
-        exchanged = exchanged_columns(block, models[0]) if models and mapped.contradicted else ""
-        solution = from_models(evidence, models, _before(context, before, kept), context.given.angles, exchanged)
+        reading = fitting_reading(block, models[0]) if models and mapped.contradicted else ""
+        solution = from_models(evidence, models, _before(context, before, kept), context.given.angles, reading)
         if not models and not stopped:
             solution.result.remarks.append(unoriented_remark(evidence))
         if not recipe.replaces:

@@ -1,4 +1,4 @@
-"""Whether given positions fit the pictures with two of their columns exchanged."""
+"""Whether given positions that contradict the pictures fit them in another reading of their columns."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from aeromatch_cli.sfm.georeferencing import place
 from aeromatch_cli.sfm.mapping import Model
 
 
-def exchanged_columns(block: Block, model: Model) -> str:
-    """Return the columns whose exchange makes the given positions fit a model that contradicts them, "" for none.
+def fitting_reading(block: Block, model: Model) -> str:
+    """Return how the given positions fit a model that contradicts them: "exchanged" (latitude and longitude),
+    "mirrored", or "" where they do not.
 
-    Longitudes in the place of latitudes lie in another zone: they are not merely mirrored there.
+    Longitudes in the place of latitudes lie in another zone: they are not merely mirrored there. With x and y
+    exchanged, or one of them of another sign, positions are the same up to a turn about the vertical.
     """
     ids = sorted(model.centers_m.keys() & block.poses.keys())
     if len(ids) < 3:  # two of them fit anything
@@ -24,16 +26,16 @@ def exchanged_columns(block: Block, model: Model) -> str:
     centers = np.array([model.centers_m[i] for i in ids])
     given_m = np.array([block.poses[i].center_m for i in ids])
     sigmas_m = np.array([block.poses[i].sigma_position_m for i in ids])
-    for words, positions_m in _readings(block, given_m):
+    for reading, positions_m in _readings(block, given_m):
         placement = place(centers, model.points_m, positions_m, sigmas_m)
         # Some of few positions fit any reading by chance.
         if placement.kind == "positions" and not placement.contradiction and placement.trusted:
-            return words
+            return reading
     return ""
 
 
 def _readings(block: Block, given_m: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """Names of columns, and positions (N, 3) with these exchanged, about their middle."""
+    """Names of readings, and positions (N, 3) in these, about their middle."""
     if block.crs != LOCAL:
         latitudes, longitudes = geographic_from_grid(block.crs, given_m[:, :2] + np.array(block.origin_m[:2])).T
         try:
@@ -42,5 +44,5 @@ def _readings(block: Block, given_m: FloatArray) -> Iterator[tuple[str, FloatArr
             zone = ""
         places_m = grid_from_geographic(zone, longitudes, latitudes) if zone else np.full((1, 2), np.nan)
         if np.isfinite(places_m).all():
-            yield "latitude and longitude", np.column_stack([places_m - places_m.mean(axis=0), given_m[:, 2]])
-    yield "x and y", given_m[:, [1, 0, 2]]
+            yield "exchanged", np.column_stack([places_m - places_m.mean(axis=0), given_m[:, 2]])
+    yield "mirrored", given_m[:, [1, 0, 2]]
