@@ -15,7 +15,7 @@ from aeromatch_cli.report import compare as compared
 from aeromatch_cli.report.compare import Judged, Standing, as_facts, criteria, verdict_lines
 from aeromatch_cli.results.stages import BlockResults
 
-SOUND = Standing("good", 12, 0.05, frozenset({"c1", "c2"}), 3, 50_000, Judged("A", 800, 0.04))
+SOUND = Standing("good", 12, 12, 0.05, frozenset({"c1", "c2"}), 3, 50_000, Judged("A", 800, 0.04))
 
 
 @pytest.mark.parametrize(
@@ -30,8 +30,10 @@ SOUND = Standing("good", 12, 0.05, frozenset({"c1", "c2"}), 3, 50_000, Judged("A
         ({"check_m": None, "checks": frozenset()}, "neither", ""),
         ({"empty": 9}, "first", "parts of images without points, 3 in the first and 9 in the second"),
         ({"oriented": 10, "check_m": 0.01, "matches": 90_000}, "first", "images oriented, 12 in the first and 10"),
+        # A block in a frame of its own: no scale, north or place.
+        ({"georeferenced": 0, "matches": 90_000}, "first", "scale, north and place, 12 in the first and 0 in"),
         ({"verdict": "doubtful", "oriented": 12, "check_m": 0.01}, "first", "result, good in the first and doubtful"),
-        ({"verdict": None, "oriented": None, "matches": 60_000}, "second", "verified matches"),
+        ({"verdict": None, "oriented": None, "georeferenced": None, "matches": 60_000}, "second", "verified matches"),
         # Truth outranks the verdict, but that of another block says nothing.
         ({"verdict": "bad", "judged": Judged("A", 900, 0.02)}, "second", "`aeromatch evaluate`, 800 in the first and"),
         ({"verdict": "bad", "judged": Judged("A", 801, 0.02)}, "second", "evaluate`, 4.0 % in the first and 2.0 % in"),
@@ -55,10 +57,12 @@ def test_what_speaks_the_other_way_is_said() -> None:
     ]
 
 
-def side(*names: str, width_px: int = 1000, time: str = "", matches: int = 100, **found: Any) -> compared._Side:
+def side(
+    *names: str, width_px: int = 1000, time: str = "", matches: int = 100, frame: str = "world", **found: Any
+) -> compared._Side:
     images = {name: Image(name.replace(".", "_"), name, width_px, 750, "1", time=time) for name in names}
     matched = {(names[0], names[1]): matches}
-    return compared._Side({}, images, matched, {}, filled(BlockResults, found), frozenset(names), "good")
+    return compared._Side({}, images, matched, {}, filled(BlockResults, found), dict.fromkeys(names, frame), "good")
 
 
 def outcome_of(monkeypatch: pytest.MonkeyPatch, first: compared._Side, second: compared._Side):
@@ -92,6 +96,14 @@ def test_of_blocks_that_share_most_images_these_are_compared(monkeypatch: pytest
     assert "settings    the same" in outcome.stdout
     oriented = next(one for one in outcome.facts["criteria"] if one["what"] == "images oriented")
     assert (oriented["first"], oriented["second"], oriented["better"]) == ("2", "2", "neither")
+
+
+def test_a_block_in_a_frame_of_its_own_is_worse_than_one_in_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = "a.jpg", "b.jpg", "c.jpg"
+    outcome = outcome_of(monkeypatch, side(*names, frame="own 1"), side(*names))
+    words = "better      the second: images with scale, north and place, 0 in the first and 3 in the second"
+    assert words in outcome.stdout.splitlines()
+    assert outcome.facts["better"] == "second"
 
 
 def test_what_is_compared_is_the_block_as_it_is_exported_and_what_was_left_out_is_said(

@@ -28,7 +28,8 @@ _ERROR_SHARE, _MATCHES_SHARE = 0.1, 0.05
 _OUTWARD = ("workspace", "run")
 # Of the images of the larger block: with fewer in common two blocks have nothing to be compared by.
 _LEAST_COMMON = 0.5
-_UNORIENTED = "predicted"
+# Frames of orientation.csv.
+_WORLD, _UNORIENTED = "world", "predicted"
 
 
 class Judged(NamedTuple):
@@ -44,7 +45,8 @@ class Judged(NamedTuple):
 class Standing:
     """What speaks for one side; None where it is not known.
 
-    verdict: as `aeromatch run` says it. oriented: images of those in both. check_m: error at check points, root mean
+    verdict: as `aeromatch run` says it. oriented: images of those in both. georeferenced: those of them that are not in
+    a frame of their own, whose scale, north and place are arbitrary. check_m: error at check points, root mean
     square of their distances, and checks: which these are. empty: parts of images (3 x 3 each) without a point though
     other images show them. matches: verified ones of pairs of images in both. judged: by truth, which outranks all
     else.
@@ -52,6 +54,7 @@ class Standing:
 
     verdict: str | None
     oriented: int | None
+    georeferenced: int | None
     check_m: float | None
     checks: frozenset[str]
     empty: int | None
@@ -108,6 +111,8 @@ def _criteria(one: Standing, two: Standing) -> Iterator[Criterion]:
         yield _larger("result", (order.index(one.verdict), order.index(two.verdict)), (one.verdict, two.verdict))
     if one.oriented is not None and two.oriented is not None:
         yield _larger("images oriented", (one.oriented, two.oriented))
+    if one.georeferenced is not None and two.georeferenced is not None:
+        yield _larger("images with scale, north and place", (one.georeferenced, two.georeferenced))
     if one.check_m is not None and two.check_m is not None and one.checks == two.checks:
         shown = f"{one.check_m:.3f} m", f"{two.check_m:.3f} m"
         yield _larger("error at check points", (-one.check_m, -two.check_m), shown, _ERROR_SHARE)
@@ -132,15 +137,15 @@ def _larger(
 @dataclass(frozen=True)
 class _Side:
     """images: by name. matches: verified ones by pair of image names. seconds: by stage. results: of the stages.
-    oriented: names of images, None where nothing was adjusted. verdict: on the block, None where its stages have not
-    run."""
+    oriented: name -> frame of oriented images, None where nothing was adjusted. verdict: on the block, None where its
+    stages have not run."""
 
     settings: Mapping[str, Any]
     images: Mapping[str, Image]
     matches: Mapping[tuple[str, str], int]
     seconds: Mapping[str, float]
     results: BlockResults
-    oriented: frozenset[str] | None
+    oriented: Mapping[str, str] | None
     verdict: str | None
     judged: Judged | None = None
 
@@ -242,9 +247,11 @@ def _standing(side: _Side, common: Any) -> Standing:
     rmse_m = None if control is None else control.check_rmse_m
     spread = {} if consistent is None else consistent.spread
     names = {image.image_id: name for name, image in side.images.items()}
+    frames = None if side.oriented is None else [frame for name, frame in side.oriented.items() if name in common]
     return Standing(
         verdict=side.verdict,
-        oriented=None if side.oriented is None else len(side.oriented & common),
+        oriented=None if frames is None else len(frames),
+        georeferenced=None if frames is None else frames.count(_WORLD),
         check_m=None if rmse_m is None else float(np.linalg.norm(rmse_m)),
         checks=frozenset() if control is None else frozenset(control.checks),
         empty=sum(ninths.empty for i, ninths in spread.items() if names.get(i) in common) if spread else None,
@@ -304,8 +311,8 @@ def _final_matches(block: OpenedBlock, pair: Pair) -> int:
     return len(entry.matches.indices) if entry is not None and entry.verdict.state == "verified" else 0
 
 
-def _oriented(workspace: Workspace) -> frozenset[str] | None:
+def _oriented(workspace: Workspace) -> dict[str, str] | None:
     path = workspace.orientation / "orientation.csv"
     if not path.is_file():
         return None
-    return frozenset(row["image"] for row in read_csv(path) if row["frame"] != _UNORIENTED)
+    return {row["image"]: row["frame"] for row in read_csv(path) if row["frame"] != _UNORIENTED}
