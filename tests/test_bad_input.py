@@ -75,6 +75,18 @@ def test_one_bad_image_never_stops_the_rest(site, how):
     assert repaired.counts("extract")[0] == 1
 
 
+def test_a_bad_image_is_named_once_by_its_name(site):
+    """The first pass meets it, the step of the cascade, and the stage that joins the steps."""
+    bad = site.image(2)
+    spoil(bad, "cut off")
+    outcome = site("run", "--set", "orient=global", "--set", "cascade=guided")
+    assert outcome.code == 1
+    (line,) = [line for line in outcome.stderr.splitlines() if bad.stem in line]
+    assert line.startswith(f"extract: {bad.name}: ")
+    assert f"{IMAGES - 1} of {IMAGES} images oriented" in outcome.stdout
+    assert f"1 of {IMAGES} images is not in the block, since the pictures could not be read" in outcome.stdout
+
+
 def test_a_bad_image_that_is_removed_is_no_failure_any_more(site):
     spoil(site.image(2), "cut off")
     assert site("run").code == 1

@@ -172,5 +172,11 @@ def test_an_image_that_could_not_be_read_is_a_fault_of_its_own() -> None:
     assert not any(words in line for line in lines for words in ("weak", "overlap", "groups", "oriented:"))
 
 
+def test_images_that_could_not_be_read_are_in_no_count_of_oriented_ones() -> None:
+    lost = {"outside": {"c": "no pairs", "d": "no features: cannot decode image d.jpg"}, "images": 2}
+    lines = lines_of(filter={"components": [2, 1], "unread": ["d"]}, adjust=lost, spread={})
+    assert any("2 of 3 images that could be read are oriented: not oriented: c.jpg" in line for line in lines)
+
+
 def test_a_part_of_a_run_has_no_verdict() -> None:
     assert quality_of(filled(BlockResults, filter={"components": [4]}), NAMES) is None

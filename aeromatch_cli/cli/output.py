@@ -180,6 +180,19 @@ def as_epilog(examples: Sequence[str]) -> str:
     return "\b\nExamples:\n" + "\n".join(f"  {example}" for example in examples)
 
 
+def _once() -> Callable[[logging.LogRecord], bool]:
+    """A filter that lets the same words through once: the first pass, every step of a cascade and the stage that joins
+    them meet the same broken image."""
+    said = set[str]()
+
+    def is_new(message: logging.LogRecord) -> bool:
+        words, before = message.getMessage(), len(said)
+        said.add(words)
+        return len(said) > before
+
+    return is_new
+
+
 @contextmanager
 def logged_to(log_file: Path | None, *, quiet: bool) -> Iterator[None]:
     """Send messages to stderr, and all of them and the record, with time, to the log file: when the command began, what
@@ -191,6 +204,7 @@ def logged_to(log_file: Path | None, *, quiet: bool) -> Iterator[None]:
     screen.setLevel(logging.ERROR if quiet else logging.INFO)
     screen.setFormatter(logging.Formatter("%(message)s"))
     screen.addFilter(lambda message: message.name != record.name)
+    screen.addFilter(_once())
     handlers: list[logging.Handler] = [screen]
     if log_file is not None:
         try:

@@ -213,7 +213,7 @@ def _quality(context: Context, adjustment: Adjustment) -> Quality | None:
     """None where the adjustment on file is of earlier matches."""
     if adjustment.outdated:
         return None
-    return quality_on_file(context.workspace, {image.image_id: image.name for image in context.block.images})
+    return quality_on_file(context.workspace, context.names)
 
 
 def _verdict(quality: Quality | None) -> list[tuple[str, str, str]]:

@@ -266,12 +266,11 @@ def _attempt(asked: _Asked) -> Result:
             "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
             "(`aeromatch run` does everything)"
         )
-    names = {image.image_id: image.name for image in context.block.images}
     failures = all_failures(command, context, reports)
     unjudged = _unjudged(context) if command == "match" else 0
     old_page = command in JUDGED and report.is_of_earlier_results(context.workspace)
     return command_result(
-        command, context.settings, context.workspace, names, reports, failures, said,
+        command, context.settings, context.workspace, context.names, reports, failures, said,
         part=context.scope.shard is not None, old_page=old_page, unjudged=unjudged,
     )  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -42,8 +42,12 @@ class StageReport:
     started: float = field(default_factory=time.perf_counter)
     part: str = ""
 
-    def write(self, context_workspace: Workspace, shard: Shard | None = None) -> StageReport:
+    def write(
+        self, context_workspace: Workspace, shard: Shard | None = None, names: Mapping[str, str] | None = None
+    ) -> StageReport:
         """Close the clock, write the report and gather failures.csv from all stages.
+
+        names: of the files, by image_id; else those that the workspace has, which the first pass's has not.
 
         A stage that made nothing, and fails where it failed before, leaves that report, with its timing; not where a
         shard has failed since, which this one supersedes.
@@ -54,7 +58,7 @@ class StageReport:
             write_json(path, self._record().as_json())
         gather_failures(context_workspace)
         if self.failures and self.stage != "orient":  # its first pass has named them
-            names = names_on_file(context_workspace)
+            names = names or names_on_file(context_workspace)
             for item, reason in self.failures:
                 log.warning("%s: %s: %s", self.stage, item_named(item, names), reason)
         return self

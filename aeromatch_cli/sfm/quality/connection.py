@@ -66,7 +66,8 @@ def left_out(evidence: QualityInput) -> Found:
     outside = list(evidence.adjust.outside)
     missing = max(len(outside), evidence.images - evidence.adjust.images)
     oriented = evidence.images - missing
-    words = f"{oriented} of {evidence.images} images {form(oriented, 'is', 'are')} oriented"
+    readable = " that could be read" if evidence.unread else ""
+    words = f"{oriented} of {evidence.images} images{readable} {form(oriented, 'is', 'are')} oriented"
     if outside:
         one = evidence.names.get(outside[0], outside[0])
         remedy = (
