@@ -56,9 +56,8 @@ def translated_os_errors(path: Path) -> Iterator[None]:
             raise WorkspaceError(
                 f"cannot write {path}: a file stands where a folder is needed; choose another --workspace"
             ) from error
-        if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
-            raise WorkspaceError(f"cannot write {path} ({error.strerror}); choose another --workspace") from error
-        raise WorkspaceError(f"cannot write {path}: {error}") from error
+        reason = error.strerror or error
+        raise WorkspaceError(f"cannot write {path} ({reason}); choose another --workspace") from error
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:

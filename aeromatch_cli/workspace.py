@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from aeromatch_cli.errors import InputError, WorkspaceError
+from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.files import (
     changed_files,
     json_object,
@@ -278,20 +278,22 @@ def _links_below(folder: Path) -> Iterator[Path]:
 def opened_workspace(root: Path, *, tables: bool = True) -> Workspace:
     """One that a command wrote, to look at. tables: whether those of the block are compared with their checksums.
 
-    Raises InputError where the folder is none, WorkspaceError where it has another format version or a table of the
-    block is not as it was written.
+    Raises ConfigError where the folder is none, InputError where it holds no results yet, WorkspaceError where it has
+    another format version or a table of the block is not as it was written.
     """
     workspace = Workspace(root)
     if not workspace.images.is_file():
         if not root.exists():
-            raise InputError(
+            raise ConfigError(
                 f"the workspace {root} does not exist: check its path, and give the folder that an earlier `aeromatch "
                 "run --workspace DIR` has filled"
             )
         if workspace.orientation.is_dir():
             state = "holds no results yet (images.csv is missing): its run is estimating the orientation, or was ended"
             raise InputError(f"{root} {state} while it did; `aeromatch run` goes on with it")
-        raise InputError(f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace")
+        raise ConfigError(
+            f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace"
+        )
     workspace.check_version()
     if tables:
         workspace.check_tables()

@@ -120,7 +120,7 @@ def test_the_summary_tells_what_views_cost(site, command):
 
 def test_commands_that_need_an_earlier_one_say_so(site):
     outcome = site("filter")
-    assert (outcome.code, "does not exist: run `aeromatch run`" in outcome.stderr) == (3, True)
+    assert (outcome.code, "does not exist: run `aeromatch run`" in outcome.stderr) == (2, True)
     assert site("pairs").code == 0
     outcome = site("filter")
     assert (outcome.code, "run `aeromatch match` first" in outcome.stderr) == (3, True)

@@ -85,8 +85,8 @@ def test_it_takes_a_workspace_alone(done_site: Site) -> None:
 def test_a_folder_without_results_is_none(tmp_path: Path) -> None:
     (tmp_path / "block.json").write_text("{}")  # a rendered block has one, too
     outcome = invoke("check", "--deep", str(tmp_path))
-    assert outcome.code == 3
+    assert outcome.code == 2
     assert "is no workspace of aeromatch" in outcome.stderr
     absent = invoke("check", "--deep", str(tmp_path / "absent"))
-    assert absent.code == 3
+    assert absent.code == 2
     assert f"the workspace {tmp_path / 'absent'} does not exist: check its path" in absent.stderr

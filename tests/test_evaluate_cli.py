@@ -44,10 +44,10 @@ def test_the_report_shows_it(site: Path) -> None:
 
 def test_wrong_arguments_say_what_to_do(site: Path, tmp_path: Path) -> None:
     missing = invoke("evaluate", site / "work", "--truth", tmp_path, "--no-mapping")
-    assert missing.code == 3
+    assert missing.code == 2
     assert str(tmp_path) in missing.stderr
     nothing = invoke("evaluate", tmp_path, "--truth", tmp_path)
-    assert nothing.code == 3
+    assert nothing.code == 2
     assert "no workspace" in nothing.stderr
 
 

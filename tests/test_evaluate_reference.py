@@ -79,7 +79,7 @@ def test_a_folder_with_reference_poses_or_its_parent_is_opened(tmp_path: Path) -
 
 
 def test_what_is_no_truth_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no truth"):
+    with pytest.raises(ConfigError, match="holds no truth"):
         open_truth(tmp_path)
     with pytest.raises(InputError, match="ground_z"):
         open_truth(write_reference(tmp_path / "flat", ground_z=None))

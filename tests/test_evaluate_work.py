@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import HEIGHT, IMAGES, WIDTH
 
-from aeromatch_cli.errors import InputError
+from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.evaluate import evaluate_workspace
 from aeromatch_cli.evaluate.mapping import map_database
 from aeromatch_cli.evaluate.output import condition_rows, facts, lines, summary_rows, write_evaluation
@@ -166,9 +166,9 @@ def test_an_export_of_earlier_matches_is_not_mapped(work: Path, rendered: Path, 
 
 
 def test_what_does_not_belong_together_is_refused(work: Path, rendered: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no workspace.*images\.csv"):
+    with pytest.raises(ConfigError, match=r"no workspace.*images\.csv"):
         judged(tmp_path, rendered)
-    with pytest.raises(InputError, match="holds no truth"):
+    with pytest.raises(ConfigError, match="holds no truth"):
         judged(work, tmp_path)
     copy = tmp_path / "work"
     shutil.copytree(work, copy)

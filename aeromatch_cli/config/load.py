@@ -21,10 +21,17 @@ from aeromatch_cli.config.reading import UniqueKeyLoader, read_text
 from aeromatch_cli.config.schema import FAMILIES, Settings
 from aeromatch_cli.errors import ConfigError
 
+# Is read as a preset where it is named, and offered nowhere.
+_ALL_SETTINGS = "default"
+
 
 def preset_names() -> list[str]:
-    """Presets that ship with the package."""
-    return sorted(path.stem for path in _preset_folder().glob("*.yaml"))
+    """Presets that ship with the package, but for the commented list of all settings: that is `baseline`."""
+    return sorted(path.stem for path in _preset_folder().glob("*.yaml") if path.stem != _ALL_SETTINGS)
+
+
+def _is_preset(name: Any) -> bool:
+    return name in (*preset_names(), _ALL_SETTINGS)
 
 
 def differences_of_preset(name: str) -> tuple[str, dict[str, Any]]:
@@ -95,7 +102,7 @@ def parse_method(text: str) -> tuple[str, list[str]]:
 
 
 def _merge_preset(tree: dict[str, Any], name: Any, origin: str) -> None:
-    if name not in preset_names():
+    if not _is_preset(name):
         hint = nearest(str(name), preset_names(), otherwise="")
         raise ConfigError(f"{origin}: preset {name!r} is none of {', '.join(preset_names())}{hint}")
     merge(tree, differences_of_preset(name)[1])
@@ -120,10 +127,10 @@ def _text_of(source: str) -> tuple[str, str, Path | None]:
     """Return the text of a preset, file or workspace, the source in words, and the folder of a file. Raises
     ConfigError."""
     path = Path(source)
-    if source not in preset_names() and (path / "block.json").is_file():
+    if not _is_preset(source) and (path / "block.json").is_file():
         path /= "config.yaml"  # of a workspace
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
-    if not is_yaml and source in preset_names():
+    if not is_yaml and _is_preset(source):
         return read_text(_preset_folder() / f"{source}.yaml"), f"preset {source}", None
     if (path / ".lock").is_file():
         raise ConfigError(

@@ -70,8 +70,7 @@ def choices(family: str = "") -> dict[str, Any]:
 
 
 def _purposes() -> dict[str, str]:
-    names = [name for name in preset_names() if name != "default"]
-    order = sorted(names, key=lambda name: (name != DEFAULT_PRESET, name))
+    order = sorted(preset_names(), key=lambda name: (name != DEFAULT_PRESET, name))
     return {name: differences_of_preset(name)[0] for name in order}
 
 

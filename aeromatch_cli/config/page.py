@@ -57,7 +57,7 @@ def _contents() -> Iterator[str]:
 
 
 def _presets() -> Iterator[str]:
-    for name in (name for name in preset_names() if name != "default"):
+    for name in preset_names():
         comment, tree = differences_of_preset(name)
         yield f"- `{name}`: {comment}"
         chosen = ", ".join(f"`{text}`" for key, value in tree.items() for text in _written(key, value))

@@ -20,7 +20,7 @@ from aeromatch_cli.strategies import Strategy
 _WIDTH = 100
 _HEADING = """\
 Every setting with its default and meaning. A configuration of your own needs only what differs from
-a preset, named by its key `preset` (auto if it names none; `preset: default` is what stands here).
+a preset, named by its key `preset` (auto if it names none; `preset: baseline` is what stands here).
 Paths are relative to the file that they stand in. On the command line
 `--set extract.keypoints=12000` changes one setting, `--set match=NAME` takes another strategy, and
 `--set filter.poselib.threshold_px=2` reaches into a chain; a chain is also written NAME+NAME.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray
-from aeromatch_cli.errors import InputError
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate.reference import ReferenceTruth, load_reference
 from aeromatch_cli.evaluate.scores import Conditions, PairScore
 
@@ -47,13 +47,14 @@ class BlockTruth(Protocol):
 
 
 def open_reference(folder: Path) -> ReferenceTruth:
-    """The reference poses in a folder: poses.csv and block.json, there or in its subfolder reference. Raises InputError
-    where it holds none, or something damaged.
+    """The reference poses in a folder: poses.csv and block.json, there or in its subfolder reference.
+
+    Raises ConfigError where it holds none, InputError where they cannot be used.
     """
     for place in (folder, folder / "reference"):
         if all((place / name).is_file() for name in _REFERENCE_FILES):
             return load_reference(place, existing(folder / "images") or existing(place.parent / "images"))
-    raise InputError(
+    raise ConfigError(
         f"{folder} holds no truth: give the folder that synth wrote (truth.json), or one with reference poses "
         f"({' and '.join(_REFERENCE_FILES)})"
     )

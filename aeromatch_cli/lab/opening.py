@@ -13,8 +13,8 @@ from aeromatch_cli.lab.synthetic.truth import load_truth
 def open_truth(folder: Path) -> BlockTruth:
     """The truth in a folder: a rendered block (truth.json), or reference poses.
 
-    Raises InputError where it holds neither, or something damaged; ConfigError where a rendered block needs a library
-    that is not installed.
+    Raises ConfigError where it holds neither, or a rendered block needs a library that is not installed; InputError
+    where it holds something damaged.
     """
     if (folder / "truth.json").is_file():
         check_installed()

@@ -156,8 +156,8 @@ class _Side:
 
 
 def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
-    """In words, and as facts. Raises InputError where a folder is no workspace, ConfigError where their images are not
-    the same."""
+    """In words, and as facts. Raises ConfigError where a folder is no workspace, or their images are not the same,
+    InputError where one holds no results yet."""
     one, two = _side(first), _side(second)
     _check_images(first, second, one, two)
     lines = [f"first       {first}", f"second      {second}"]

@@ -104,7 +104,7 @@ def execute(
     deadline = None if within is None else Deadline(within, started=now)
     root = Path(settings.workspace)
     if settings.block.images and command in graph.NEED_RESULTS and not root.exists():
-        raise InputError(f"the workspace {root} does not exist: run `aeromatch run`, which makes it, or name another")
+        raise ConfigError(f"the workspace {root} does not exist: run `aeromatch run`, which makes it, or name another")
     with ExitStack() as stack:
         stack.enter_context(_nothing_left_of_a_failed_start(Workspace(root), shared=part is not None))
         if command != "check" and (not settings.block.images or _there(settings)):
