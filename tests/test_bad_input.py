@@ -267,6 +267,21 @@ def test_wrong_arguments_name_themselves(site, arguments, words):
     assert not (site.work / "features").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--crs", "EPSG:99999"], "crs 'EPSG:99999' is unknown"),
+        (["--crs", "EPSG:4326"], "is not projected"),
+        (["--set", "block.heights=EPSG:32633"], "heights 'EPSG:32633' are unknown"),
+    ],
+)
+def test_an_unfit_crs_is_refused_before_the_images_are_read(site, arguments, words, monkeypatch):
+    read = []
+    monkeypatch.setattr("aeromatch_cli.stages.block.scan_images", lambda *given: read.append(given))
+    outcome = site("run", *arguments)
+    assert (outcome.code, words in outcome.stderr, read) == (2, True, []), outcome.stderr
+
+
 def test_wrong_configuration_files(site):
     for text, words in (
         ("extract: {keypoint: 3}\n", "unknown key"),

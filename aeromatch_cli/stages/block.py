@@ -19,7 +19,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from aeromatch_cli.blocks.control import read_control
-from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, world_crs
+from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, checked_heights, world_crs
 from aeromatch_cli.blocks.doubles import doubles
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
@@ -73,7 +73,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor, ind
     or InputError where nothing can be started."""
     if not settings.block.images:
         raise ConfigError("no images: give --images DIR, or block.images in the configuration")
-    _check_folders(settings, workspace)
+    _check_given(settings, workspace)
     before = read_json(workspace.block) if workspace.block.is_file() else {}
     inputs, prints, touched, remote = _read_inputs(settings, workspace, executor, index, before)
     ground, source, remarks = given_ground(settings, inputs)
@@ -166,8 +166,13 @@ def block_record(block: Block, given: Block, settings: Settings) -> dict[str, An
     }
 
 
-def _check_folders(settings: Settings, workspace: Workspace) -> None:
+def _check_given(settings: Settings, workspace: Workspace) -> None:
+    """Raise ConfigError for what is wrong whatever the images are: before thousands of them are read."""
     given = settings.block
+    if not _is_auto(given.crs):
+        checked_crs(world_crs(given.crs))
+    if not _is_auto(given.heights):
+        checked_heights(given.heights)
     if given.masks and not (Path(given.masks).is_dir() or Path(given.masks).is_file()):
         what = "are neither a folder nor a file" if Path(given.masks).exists() else "do not exist"
         raise ConfigError(f"masks {given.masks} {what}: give a folder of masks, or one mask, with --masks")
@@ -264,7 +269,11 @@ def _digest(picture: Path | RemoteFile) -> str:
 
 def _same_crs(given: str, known: str) -> bool:
     """Whether the user asks for no other CRS than the one of an earlier run."""
-    return given.strip().lower() in ("", AUTO) or checked_crs(world_crs(given)) == known
+    return _is_auto(given) or checked_crs(world_crs(given)) == known
+
+
+def _is_auto(given: str) -> bool:
+    return given.strip().lower() in ("", AUTO)
 
 
 _Header = tuple[ExifFacts | str, str]
