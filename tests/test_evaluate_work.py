@@ -126,6 +126,8 @@ def test_files_hold_what_was_found(work: Path, evaluation: Evaluation) -> None:
     write_evaluation(evaluation)
     assert {path: path.read_bytes() for path in written} == again
     shown = dict(summary_rows(evaluation))
+    hidden, unseen = (sum(getattr(row.score, name) for row in evaluation.pairs) for name in ("hidden", "unseen"))
+    assert shown["hidden, unseen"].startswith(f"{hidden}, {unseen} (wrong: on a surface that the other image does not")
     assert shown["mapping"] == f"{evaluation.consumer['registered']} of {IMAGES} images in one model"
     assert shown["pairs with 30 correct"] == str(found["totals"]["pairs_with_30_correct"])
     assert len({len(row) for row in condition_rows(evaluation)}) == 1

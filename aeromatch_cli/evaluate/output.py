@@ -99,7 +99,11 @@ def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("correct", f"{_shown(figures['correct'])} (correctness {_shown(figures['correctness'])})"),
         ("within 5 px", _shown(figures["within_5px_share"])),
         ("recall", f"{_shown(figures['recall'])} of {_shown(figures['possible'])} possible"),
-        ("hidden, unseen", f"{_shown(figures['hidden'])}, {_shown(figures['unseen'])}"),
+        (
+            "hidden, unseen",
+            f"{_shown(figures['hidden'])}, {_shown(figures['unseen'])} (wrong: on a surface that the other image does "
+            "not see; in the sky, or outside the other image)",
+        ),
         ("error mean, median", f"{_shown(figures['mean_error_px'])}, {_shown(figures['median_error_px'])} px"),
         ("coverage, median", _shown(figures["coverage"])),
         (
