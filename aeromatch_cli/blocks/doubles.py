@@ -48,9 +48,9 @@ def remarks_on(found: Mapping[str, str], of_all: Sized) -> list[str]:
     if not found:
         return []
     pairs = [f"{name} is a copy of {first}" for name, first in found.items()]
-    what = of_images(pairs, of_all, "has the same contents as another", "have the same contents as others")
+    what = f"{form(len(pairs), 'has', 'have')} the same contents as {form(len(pairs), 'another', 'others')}"
     done = form(len(pairs), "the copy is left out and can be deleted", "the copies are left out and can be deleted")
-    return [f"{what}: {done}"]
+    return [f"{len(pairs):,} of {len(of_all):,} images {what} ({listed(pairs)}): {done}"]
 
 
 def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
