@@ -279,6 +279,11 @@ class Block:
         return _aside(self.poses, self.frames, in_world=in_world)
 
     @property
+    def names(self) -> dict[str, str]:
+        """image_id -> name of its file."""
+        return {image.image_id: image.name for image in self.images}
+
+    @property
     def views_gsd_m(self) -> float | None:
         """The common ground sampling distance of the ground views, or None as gsd_m."""
         return self.gsd_m if self.gsd_m is None or self.reduced_gsd_m is None else self.reduced_gsd_m

@@ -39,7 +39,7 @@ def warnings_of(block: Block, unpaired: Collection[str] = ()) -> tuple[str, ...]
     unpaired: names of the images that no pair holds.
     """
     ids = [i.image_id for i in block.images if i.image_id in block.poses]
-    names_by_id = {image.image_id: image.name for image in block.images}
+    names_by_id = block.names
     names = np.array([names_by_id[image_id] for image_id in ids], dtype=object)
     centers = np.array([block.poses[image_id].center_m for image_id in ids]).reshape(-1, 3)
     degenerate = {i: one.degenerate for i, one in block_footprints(block).items() if one.degenerate is not None}

@@ -123,7 +123,7 @@ def _plain(value: Any) -> Any:
 
 def summarise(block: Block, pairs: Sequence[Pair] | None = None) -> BlockSummary:
     """Figures and plausibility of a block. pairs: the chosen pairs, or None before they are chosen."""
-    names = {image.image_id: image.name for image in block.images}
+    names = block.names
     poses = {i: block.poses[i] for i in names if i in block.poses and np.isfinite(block.poses[i].center_m).all()}
     # Lengths and the vertical of a frame of its own are others than those of the first part.
     apart = block.aside(in_world=False)

@@ -213,7 +213,7 @@ def _quality(context: Context, adjustment: Adjustment) -> Quality | None:
     """None where the adjustment on file is of earlier matches."""
     if adjustment.outdated:
         return None
-    return quality_on_file(context.workspace, context.names)
+    return quality_on_file(context.workspace, context.block.names)
 
 
 def _verdict(quality: Quality | None) -> list[tuple[str, str, str]]:

@@ -230,7 +230,7 @@ def _counts(*counts: tuple[int | None, *tuple[str, ...]]) -> Iterator[str]:
 def failure_rows(context: Context) -> list[dict[str, str]]:
     """Rows of failures.csv: stage, item, reason."""
     path = context.workspace.failures
-    names = context.names
+    names = context.block.names
     rows = read_csv(path) if path.is_file() else []
     # Those of an earlier version have ids.
     return [{**row, "item": item_named(row["item"], names)} for row in rows]

@@ -101,7 +101,7 @@ def _with_more_images(context: Context, groups: Sequence[Group]) -> tuple[Contex
         return context, groups, []
     block = replace(context.block, cameras=found.cameras, poses=found.poses, frames=own_frames(found.groups))
     words = f"oriented from the verified matches: {len(images)} images, {len(oriented)} from the first pass"
-    names = context.names
+    names = context.block.names
     return replace(context, block=block), found.groups, [words, *single_pair_words(found.result, names)]
 
 
@@ -196,7 +196,7 @@ def _result(
         readout_not_tried=readout_not_tried(context, adjusted.poses),
         control=control,
         remarks=_remarks(context, adjusted, groups, control),
-        residuals=residual_figures(residuals, context.names),
+        residuals=residual_figures(residuals, context.block.names),
     )
 
 

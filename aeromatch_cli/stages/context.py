@@ -223,11 +223,6 @@ class Context:
     def image_by_id(self) -> Mapping[str, Image]:
         return _image_index(self.block)
 
-    @property
-    def names(self) -> dict[str, str]:
-        """Return image_id -> name of its file."""
-        return {image_id: image.name for image_id, image in self.image_by_id.items()}
-
     def geometry(self, pair: Pair) -> PairGeometry:
         """Return what is known of a pair. Poses in frames of their own say nothing of images outside these."""
         images = self.image_by_id

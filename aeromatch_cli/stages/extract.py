@@ -110,7 +110,7 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     context.index.flush()
     if made:
         report.result = _result(made, tasks, report.result)
-    return report.write(context.workspace, context.scope.shard, context.names)
+    return report.write(context.workspace, context.scope.shard, context.block.names)
 
 
 def _result(made: Sequence[Extracted], tasks: Sequence[ExtractTask], before: StageResult | None) -> ExtractResult:

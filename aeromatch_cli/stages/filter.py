@@ -123,7 +123,7 @@ def run(context: Context) -> StageReport:
     ids = sorted(image.image_id for image in context.block.images)
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs), ids)
     report.result = _result_on_file(context, report) or connection(context)
-    return report.write(context.workspace, context.scope.shard, context.names)
+    return report.write(context.workspace, context.scope.shard, context.block.names)
 
 
 def _result_on_file(context: Context, report: StageReport) -> FilterResult | None:

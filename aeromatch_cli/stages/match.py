@@ -168,4 +168,4 @@ def run(context: Context) -> StageReport:
     if report.done:
         report.result = MatchResult(matches=sum(result.found for result in results))
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
-    return report.write(context.workspace, context.scope.shard, context.names)
+    return report.write(context.workspace, context.scope.shard, context.block.names)

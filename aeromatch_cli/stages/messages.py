@@ -111,7 +111,7 @@ def orientation_lines(
 ) -> list[str]:
     """Say how the block was oriented, and what of the given poses and cameras is wrong. guessed_cameras: those whose
     focal length was a guess."""
-    names = {image.image_id: image.name for image in block.images}
+    names = block.names
     words = _given_words(found, given) if found.poses_from == "given poses" else _picture_words(found, given, block)
     for camera_id, focal in found.focal_lengths.items():
         kept = ", but the given one is kept" if found.stays else ""
@@ -148,7 +148,7 @@ def _picture_words(found: OrientResult, given: Block, block: Block) -> list[str]
     sizes = [str(model.images) for model in found.models] or ["none"]
     groups = sizes[0] if len(sizes) == 1 else f"groups of {', '.join(sizes[:-1])} and {sizes[-1]}"
     words = [f"from the pictures: {groups} of {len(block.images)} images"]
-    words += single_pair_words(found, {image.image_id: image.name for image in block.images})
+    words += single_pair_words(found, block.names)
     words += [_explained_words(found)] if _has_attitudes(given) else []
     words += [
         f"by a further first pass, with {one.change}: a group of {one.images_then} images, not {one.images}"

@@ -270,7 +270,7 @@ def _attempt(asked: _Asked) -> Result:
     unjudged = _unjudged(context) if command == "match" else 0
     old_page = command in JUDGED and report.is_of_earlier_results(context.workspace)
     return command_result(
-        command, context.settings, context.workspace, context.names, reports, failures, said,
+        command, context.settings, context.workspace, context.block.names, reports, failures, said,
         part=context.scope.shard is not None, old_page=old_page, unjudged=unjudged,
     )  # fmt: skip
 

@@ -300,7 +300,7 @@ def _models_remark(models: Mapping[str, Model]) -> list[str]:
 def _write_worlds(folder: Path, block: Block, models: Mapping[str, Model]) -> None:
     """world.json, with the images of every frame where there is another than the block's own, and one in the folder of
     every model that lies in such."""
-    names = {image.image_id: image.name for image in block.images}
+    names = block.names
     frames = []
     elsewhere = [name for name, model in models.items() if name != _SPARSE or (block.metric and model.frame)]
     for name, model in models.items() if elsewhere else ():
