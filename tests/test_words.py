@@ -105,6 +105,7 @@ def test_a_guessed_focal_length_is_named_where_many_positions_are_wrong() -> Non
     block: Any = SimpleNamespace(
         images=[SimpleNamespace(image_id=name, name=f"{name}.jpg") for name in "abc"],
         poses=dict.fromkeys("abc", pose),
+        names={name: f"{name}.jpg" for name in "abc"},
         crs="local",
     )
     found = filled(OrientResult, poses_from="pictures", frame="world", wrong_positions={"a": 40.0, "b": 30.0})
