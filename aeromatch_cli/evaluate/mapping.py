@@ -58,19 +58,14 @@ def _map(database: Path, images_folder: Path, out: Path, mapper: str) -> None:
     pycolmap.logging.minloglevel = 3
     sparse = out.with_name("sparse")
     sparse.mkdir()
-    with pycolmap.Database.open(database) as opened:
-        # Its terms that divide leave all bounds where few images tell them from the others: no image is left then.
-        determined = all(camera.model.name != "FULL_OPENCV" for camera in opened.read_all_cameras())
     started = time.perf_counter()
     if mapper == "global":
         options = pycolmap.GlobalPipelineOptions()
         options.random_seed = options.mapper.random_seed = 0
-        options.mapper.bundle_adjustment.refine_extra_params = determined
         models = pycolmap.global_mapping(database, images_folder, sparse, options)
     else:
         one_by_one = pycolmap.IncrementalPipelineOptions()
         one_by_one.random_seed = 0
-        one_by_one.ba_refine_extra_params = determined
         models = pycolmap.incremental_mapping(database, images_folder, sparse, options=one_by_one)
     seconds = time.perf_counter() - started
     facts: dict[str, Any] = {"registered": 0, "models": len(models), "seconds": seconds}

@@ -186,6 +186,17 @@ def in_colmap(camera: Camera) -> Nearest:
     return nearest_of(camera, [name for name in MODELS[BROWN] if name != "b2"])
 
 
+def in_colmaps_mappers(camera: Camera) -> Nearest:
+    """The camera that COLMAP's mappers can refine: itself, or the nearest one of OPENCV.
+
+    The only model of COLMAP that holds k3, FULL_OPENCV, has terms that divide: mappers free them with the others, where
+    blocks of some images do not determine them, and lose the block.
+    """
+    if is_fisheye(camera) or not (parameters(camera)["skew"] or parameters(camera)["k3"]):
+        return Nearest(camera)
+    return nearest_of(camera, [name for name in MODELS[BROWN] if name not in ("k3", "b2")])
+
+
 def fitted(formula: Formula, start: FloatArray, scale: FloatArray, camera: Camera) -> tuple[FloatArray, float, float]:
     """Parameters (P,) by which a formula's pixels come nearest a camera's, and the root mean square and the largest of
     their distances in pixels. scale: (P,) what makes the parameters of one order."""

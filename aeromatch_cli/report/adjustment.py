@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from aeromatch_cli.data import AdjustedBlock, Block, Camera, Pose, PoseResidual
-from aeromatch_cli.formats.adjusted import read_adjusted, read_residuals
+from aeromatch_cli.data import AdjustedBlock, Block, Camera, Pose
+from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.results.adjustment import Control
@@ -94,12 +94,6 @@ def as_adjusted(block: Block, adjusted: AdjustedBlock | None, *, in_world: bool)
         block, poses={**known, **found}, cameras={**block.cameras, **adjusted.cameras},
         ground=block.ground if held else None,
     )  # fmt: skip
-
-
-def read_position_residuals(context: Context, adjustment: Adjustment) -> dict[str, PoseResidual]:
-    """By image_id; none of earlier matches, and of an adjustment by an earlier version."""
-    path = context.workspace.residuals
-    return read_residuals(path, context.block.images) if adjustment.found.points and path.is_file() else {}
 
 
 def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> list[Notice]:

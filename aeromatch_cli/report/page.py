@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
-from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.data import AdjustedBlock, PoseResidual
 from aeromatch_cli.files import write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.geometry.footprints import block_footprints
@@ -33,7 +33,6 @@ from aeromatch_cli.report.adjustment import (
     final_points,
     images_aside,
     read_adjustment,
-    read_position_residuals,
     surveyed_rows,
 )
 from aeromatch_cli.report.calibration import CameraSection, camera_sections, heights_sections
@@ -57,7 +56,7 @@ from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.report.thumbnails import thumbnails
 from aeromatch_cli.results.stages import FilterResult, MatchResult, OrientResult, PairsResult, ReportResult
 from aeromatch_cli.sfm.quality.finding import Finding, Quality, plain
-from aeromatch_cli.stages.contents import contents_of
+from aeromatch_cli.stages.contents import contents_of, residuals_of_points
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, connection
 from aeromatch_cli.stages.messages import settled_words
@@ -163,7 +162,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment, adjusted: 
         if adjusted is None
         else residual_section(
             adjusted,
-            read_position_residuals(context, adjustment),
+            _residuals(context, adjusted),
             {row.image_id: row.name for row in images},
             gsd_m,
             adjustment.found.groups,
@@ -240,6 +239,11 @@ def _cameras(context: Context, adjustment: Adjustment, adjusted: AdjustedBlock |
         return []
     seen_px = contents_of(context, adjusted, raw=False).keypoints_px
     return camera_sections(adjustment.found, adjusted, context.block.images, seen_px)
+
+
+def _residuals(context: Context, adjusted: AdjustedBlock | None) -> dict[str, PoseResidual]:
+    """By image_id; none of earlier matches."""
+    return {} if adjusted is None else residuals_of_points(contents_of(context, adjusted, raw=False))
 
 
 def number(value: float | None, digits: int = 0, factor: float = 1.0) -> str:

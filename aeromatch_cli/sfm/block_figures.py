@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, IntArray, Pose, PoseResidual
-from aeromatch_cli.geometry.cameras import corner_params, focal_px, project
+from aeromatch_cli.geometry.cameras import corner_params, focal_px
 from aeromatch_cli.geometry.components import component_labels
+from aeromatch_cli.geometry.reprojection import with_points
 from aeromatch_cli.results.adjustment import GroupResult, PoseResiduals, Worst
 from aeromatch_cli.results.stages import FEW_POINTS, AdjustedCamera
 
@@ -120,7 +121,7 @@ def _residual(
     seen: IntArray,
 ) -> PoseResidual:
     """Return the residuals of one image. seen: (P,) images of each point."""
-    pose, track = adjusted.poses[image_id], adjusted.tracks.get(image_id, np.zeros((0, 2), np.int32))
+    pose = adjusted.poses[image_id]
     position_m, position_sigmas, rotation_deg, rotation_sigmas = (_UNKNOWN,) * 4
     if given is not None:
         position_m = pose.center_m - given.center_m
@@ -131,14 +132,9 @@ def _residual(
             turn = Rotation.from_matrix(pose.rotation.T @ given.world_rotation)
             rotation_deg = np.asarray(turn.as_rotvec(degrees=True))
             rotation_sigmas = rotation_deg / given.sigma_angle_deg
-    error_px = images_per_point = float("nan")
-    if len(track):
-        places_px = project(camera, pose.rotation, pose.center_m, adjusted.points_m[track[:, 1]])
-        errors_px = np.linalg.norm(places_px - np.asarray(keypoints_px(image_id), np.float64)[track[:, 0]], axis=1)
-        error_px, images_per_point = float(np.mean(errors_px)), float(np.mean(seen[track[:, 1]]))
-    return PoseResidual(
-        position_m, position_sigmas, rotation_deg, rotation_sigmas, error_px, len(track), images_per_point
-    )
+    nan = float("nan")
+    pose_alone = PoseResidual(position_m, position_sigmas, rotation_deg, rotation_sigmas, nan, 0, nan)
+    return with_points(pose_alone, adjusted, image_id, camera, keypoints_px, seen)
 
 
 def residual_figures(residuals: Mapping[str, PoseResidual], names: Mapping[str, str]) -> PoseResiduals:

@@ -28,6 +28,7 @@ _CENTRE, _RADIAL, _DECENTRING, _AFFINITY = 0.02, 0.05, 0.002, 0.0002
 _STATED = 0.25
 # Fewer images determine no more than the focal length, and none of it.
 _FOCAL_IMAGES, _LENS_IMAGES = 3, 4
+_SKEW = LENS.index("b2")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +92,7 @@ def freed(prior: LensPrior, calibration: Calibration, switches: Mapping[str, boo
     """Return the standard deviations (12,) of the unknowns, 0 where one is held.
 
     calibration: "given" holds all, "focal" all but the focal length; "brown" frees all, whatever the block says of
-    them; "auto" leaves it to the adjustment. switches: by name, what is free or held in any case. images: that the
+    them; "auto" leaves it to the adjustment, but for a skew that nobody has stated. switches: by name, what is free or held in any case. images: that the
     camera has taken.
     """
     free = np.zeros(len(LENS), dtype=bool)
@@ -99,6 +100,9 @@ def freed(prior: LensPrior, calibration: Calibration, switches: Mapping[str, boo
         free[LENS.index("f")] = True
     if calibration in ("auto", "brown") and images >= _LENS_IMAGES:
         free[:10] = True
+        # Pixels of sensors are square: what looks like skew is a rolling shutter or positions that are off (sheffield,
+        # caliterra), and COLMAP and others have no place for it.
+        free[_SKEW] = calibration == "brown" or prior.lens[_SKEW] != 0.0
     for name, on in switches.items():
         free[LENS.index(name)] = on
     return np.where(free, prior.sigmas, 0.0)

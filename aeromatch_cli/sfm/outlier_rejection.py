@@ -48,8 +48,8 @@ class Limits:
     distance of a third image's keypoint from the place of the point there; where the rays leave that place open by more
     than a pixel, it grows with that. min_probability: a match that is less likely to be right counts as contradicting
     unless images would fall apart by that, and so are the least likely ones where a smaller share than
-    min_expected_right of the others would be right; 0 for never. raised_up_to: matches more likely than this stay
-    anyhow. min_matches: a pair with fewer ties nothing.
+    min_expected_right of the others would be right; 0 for never. most_given_up: a larger share is not dropped for that.
+    min_matches: a pair with fewer ties nothing.
     """
 
     epipolar_px: float
@@ -57,7 +57,7 @@ class Limits:
     third_px: float
     min_probability: float = 0.0
     min_expected_right: float = 0.0
-    raised_up_to: float = 1.0
+    most_given_up: float = 1.0
     min_matches: int = 15
 
     @property
@@ -124,7 +124,7 @@ def contradicting(
     likely = [None if evidence is None else probabilities(evidence, usual_px) for evidence in known]
     if limits.by_probability:
         ends = [(pair.image_id0, pair.image_id1) for pair in pairs]
-        least = least_probability(likely, limits.min_probability, limits.min_expected_right, limits.raised_up_to)
+        least = least_probability(likely, limits.min_probability, limits.min_expected_right, limits.most_given_up)
         stays = probable_enough(ends, likely, least, limits.min_matches)
         for n, (mask, p, keep) in enumerate(zip(found, likely, stays, strict=True)):
             if p is not None and keep is not None:

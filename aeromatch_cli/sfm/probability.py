@@ -7,6 +7,7 @@ A logistic model of a few properties that every match has. It was fitted on rend
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -144,17 +145,16 @@ def _logistic(values: FloatArray) -> FloatArray:
 
 
 def least_probability(
-    likely: Iterable[FloatArray | None], least: float, expected_right: float, raised_up_to: float
+    likely: Iterable[FloatArray | None], least: float, expected_right: float, most_given_up: float
 ) -> float:
-    """Return the probability from which on matches stay: `least`, or more, to `raised_up_to` at most, where the mean of
-    those would be less than `expected_right`. likely: probabilities (M,) of the matches of every pair."""
+    """Return the probability from which on matches stay: `least`, or more where the mean of those would be less than
+    `expected_right`; no larger share of them is given up for that than `most_given_up`. likely: probabilities (M,) of
+    the matches of every pair."""
     every = np.concatenate([np.zeros(0), *(p for p in likely if p is not None)])
     falling = -np.sort(-every[every >= least])
     means = np.cumsum(falling) / np.arange(1, len(falling) + 1)
-    enough = int((means >= expected_right).sum())
-    if enough == len(falling):
-        return least
-    return max(least, min(raised_up_to, float(falling[max(0, enough - 1)])))
+    enough = max(int((means >= expected_right).sum()), math.ceil((1.0 - most_given_up) * len(falling)))
+    return least if enough == len(falling) else float(falling[max(0, enough - 1)])
 
 
 def probable_enough(

@@ -16,6 +16,7 @@ from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import Dropped, read_adjusted, write_adjusted, write_dropped
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
+from aeromatch_cli.geometry.reprojection import with_errors
 from aeromatch_cli.results.stages import ConsistencyResult, FilterResult, Ninths
 from aeromatch_cli.sfm.block_figures import images_per_point, mean_error_px
 from aeromatch_cli.sfm.outlier_rejection import Limits, MatchedKeypoints, contradicting
@@ -114,7 +115,7 @@ def limits_of(recipe: BlockConsistency) -> Limits:
         recipe.third_image_px,
         recipe.min_probability,
         recipe.min_expected_right,
-        recipe.raised_up_to,
+        recipe.most_given_up,
         recipe.min_matches,
     )
 
@@ -158,7 +159,10 @@ def _left_of(context: Context, adjusted: AdjustedBlock, entries: Iterable[tuple[
         (pair.image_id0, pair.image_id1, entry.matches.indices, final.kept(pair.image_id0, entry))
         for pair, entry in entries
     )
-    return without_dropped(adjusted, pairs)
+    left = without_dropped(adjusted, pairs)
+    if left is adjusted:
+        return adjusted
+    return with_errors(left, left.cameras_of(context.block), contents_of(context, left).keypoints_px)
 
 
 def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, Ninths]:

@@ -8,13 +8,15 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from aeromatch_cli.blocks.crs import LOCAL, geographic_from_grid
-from aeromatch_cli.data import AdjustedBlock, FloatArray
+from aeromatch_cli.data import AdjustedBlock, FloatArray, PoseResidual
 from aeromatch_cli.errors import BrokenFileError, ItemError
 from aeromatch_cli.formats.adjusted import read_residuals
 from aeromatch_cli.formats.features import read_final_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
+from aeromatch_cli.geometry.reprojection import with_points
 from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.sfm.block_figures import images_per_point
 from aeromatch_cli.sfm.shutter import at_once
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.state import BlockState, Judged
@@ -87,6 +89,17 @@ def _contents(
     return ExportContents(
         block, keypoints_px, pairs, context.guessed_cameras, given, adjusted, known, residuals, colours
     )
+
+
+def residuals_of_points(contents: ExportContents) -> dict[str, PoseResidual]:
+    """Return the residuals of the adjusted images with figures of those points that final matches hold."""
+    block = contents.adjusted
+    if block is None:
+        return {}
+    seen, cameras = images_per_point(block), block.cameras_of(contents.block)
+    return {
+        i: with_points(one, block, i, cameras[i], contents.keypoints_px, seen) for i, one in contents.residuals.items()
+    }
 
 
 def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairContents]:

@@ -11,7 +11,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.results.stages import Exported, ExportResult
 from aeromatch_cli.stages.consistency import final_block, final_pairs
-from aeromatch_cli.stages.contents import contents_of
+from aeromatch_cli.stages.contents import contents_of, residuals_of_points
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.driver import run_stage
 from aeromatch_cli.stages.stage_report import StageReport, unexplained
@@ -65,6 +65,7 @@ def run(context: Context) -> StageReport:
 
 def _run_task(task: ExportTask) -> Exported:
     contents = contents_of(task.context, task.adjusted, final_pairs)
+    contents = replace(contents, residuals=residuals_of_points(contents))
     summary = task.exporter(contents, task.folder)  # type: ignore[operator]
     for remark in summary.remarks:
         log.warning("warning: export %s: %s", task.folder.name, remark)

@@ -48,13 +48,13 @@ class BlockConsistency(Strategy):
         "probable ones are dropped as well, until this share is reached. 0 = none. Larger: fewer matches, fewer of "
         "them wrong.",
     )
-    raised_up_to: float = Field(
-        0.97,
+    most_given_up: float = Field(
+        0.15,
         ge=0.0,
-        lt=1.0,
-        description="Matches that are at least as likely to be right as this stay, whatever min_expected_right asks "
-        "for: few matches of images that only one other overlaps are surer. Larger: where min_expected_right is not "
-        "reached, fewer matches, fewer of them wrong.",
+        le=1.0,
+        description="No larger share of the matches is given up for min_expected_right: on photographs of bare earth "
+        "or forest most of them would be right. Larger: where min_expected_right is not reached, fewer matches, fewer "
+        "of them wrong.",
     )
     min_matches: int = Field(
         15,

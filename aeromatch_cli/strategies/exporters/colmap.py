@@ -32,7 +32,8 @@ from aeromatch_cli.formats.adjusted import orientation_text, residuals_text
 from aeromatch_cli.geometry.cameras import colmap_camera
 from aeromatch_cli.geometry.epipolar import fundamental
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.geometry.lenses import in_colmap
+from aeromatch_cli.geometry.lenses import in_colmap, in_colmaps_mappers
+from aeromatch_cli.geometry.reprojection import with_errors
 from aeromatch_cli.geometry.rotations import to_quaternion
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents, whole_folder
@@ -54,7 +55,7 @@ class Colmap(Strategy):
     orientation.csv.
     """
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     name: Literal["colmap"] = "colmap"
     raw_matches: bool = Field(
         True, description="Also write the matches before filtering, so that COLMAP can verify them itself."
@@ -67,7 +68,7 @@ class Colmap(Strategy):
         """Replace `folder`. WorkspaceError where it cannot be written, ValueError on a match without keypoint."""
         with whole_folder(folder) as partial:
             ids = Numbers.of(contents.block)
-            lenses = {k: in_colmap(camera).camera or camera for k, camera in contents.block.cameras.items()}
+            lenses = {k: in_colmaps_mappers(camera).camera or camera for k, camera in contents.block.cameras.items()}
             counts = self._write_database(contents, lenses, ids, partial / "database.db")
             cameras, remarks = held(Solution.of(contents), "COLMAP", in_colmap)
             models = _models(contents)
@@ -94,7 +95,7 @@ class Colmap(Strategy):
     def _write_database(
         self, contents: ExportContents, lenses: Mapping[str, Camera], ids: Numbers, path: Path
     ) -> dict[str, int]:
-        """lenses: cameras of the block as COLMAP can hold them."""
+        """lenses: cameras of the block as COLMAP's mappers can refine them."""
         pycolmap = import_pycolmap()
         try:
             # No pycolmap.DatabaseTransaction: it aborts the process on a full disk, and is no faster.
@@ -320,6 +321,10 @@ def write_model(
     hold."""
     sparse.mkdir()
     adjusted = model.adjusted
+    if adjusted is not None and any(cameras[k] != camera for k, camera in adjusted.cameras.items()):
+        # Errors of what is written: of the nearest camera where COLMAP cannot hold the adjusted one.
+        lenses = {image.image_id: cameras[image.camera_id] for image in contents.block.images}
+        adjusted = with_errors(adjusted, lenses, contents.keypoints_px)
     posed = [(image, *model.poses[image.image_id]) for image in contents.block.images if image.image_id in model.poses]
     (sparse / "cameras.txt").write_text(_cameras_text(cameras, ids), encoding="utf-8")
     with (sparse / "images.txt").open("w", encoding="utf-8") as stream:
