@@ -70,22 +70,34 @@ def lens_prior(camera: Camera, focal_sigma: float) -> LensPrior:
     focal_sigma: standard deviation of its focal length, as a share of it."""
     lens, focal = lens_of(camera), focal_px(camera)
     middle = (camera.width_px - 1) / 2.0, (camera.height_px - 1) / 2.0
-    stated = bool(lens[3:10].any()) or not np.allclose(lens[1:3], middle, atol=1.0)
+    centred = np.allclose(lens[1:3], middle, atol=1.0)
+    stated = bool(lens[3:10].any()) or not centred
     radius = float(np.hypot(camera.width_px, camera.height_px)) / (2.0 * focal)
     if is_fisheye(camera):
         radius = float(np.arctan(radius))
-    share = _STATED if stated else 1.0
     sigmas = {
-        "f": focal_sigma * focal,
-        "cx": share * _CENTRE * camera.width_px,
-        "cy": share * _CENTRE * camera.width_px,
-        **{name: share * _RADIAL / radius**power for name, power in (("k1", 2), ("k2", 4), ("k3", 6))},
-        **dict.fromkeys(("p1", "p2"), share * _DECENTRING / min(radius, 1.0)),
-        **dict.fromkeys(("b1", "b2"), share * _AFFINITY * focal),
+        "cx": _CENTRE * camera.width_px,
+        "cy": _CENTRE * camera.width_px,
+        **{name: _RADIAL / radius**power for name, power in (("k1", 2), ("k2", 4), ("k3", 6))},
+        **dict.fromkeys(("p1", "p2"), _DECENTRING / min(radius, 1.0)),
+        **dict.fromkeys(("b1", "b2"), _AFFINITY * focal),
     }
     if is_fisheye(camera):
-        sigmas |= {"p1": share * _RADIAL / radius**8, "p2": 0.0, "b2": 0.0}
+        sigmas |= {"p1": _RADIAL / radius**8, "p2": 0.0, "b2": 0.0}
+    if stated:
+        # SIMPLE_RADIAL says nothing of decentring, and a principal point in the middle is one that nobody has looked for.
+        known = _terms(camera) - ({"cx", "cy"} if centred else set())
+        sigmas |= {name: _STATED * sigmas[name] for name in known}
+    sigmas["f"] = focal_sigma * focal
     return LensPrior(lens, np.array([sigmas.get(name, 0.0) for name in LENS]), is_fisheye(camera))
+
+
+def _terms(camera: Camera) -> set[str]:
+    """Names in `network.LENS` of what the camera's model has, but for the focal length."""
+    names = set(MODELS[camera.model])
+    if is_fisheye(camera):
+        return {"cx", "cy", "k1", "k2", "k3", "p1", "b1"}
+    return (names & set(LENS) - {"f"}) | ({"b1"} if "fx" in names else set())
 
 
 def freed(prior: LensPrior, calibration: Calibration, switches: Mapping[str, bool], images: int) -> FloatArray:

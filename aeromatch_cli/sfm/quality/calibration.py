@@ -194,8 +194,6 @@ def _change(camera_id: str, name: str, parameter: Parameter, sigmas: float) -> s
 
 
 def _stated(parameters: Mapping[str, Parameter]) -> set[str]:
-    """Parameters that are judged by what is known of them: of a lens that nobody has calibrated, terms of distortion
-    are what they are, and those of affinity are judged by themselves."""
-    terms = {"k1", "k2", "k3", "p1", "p2", "b1", "b2"}
-    calibrated = any(parameters[name].prior != 0.0 for name in terms & parameters.keys())
-    return {"f", "cx", "cy"} | (terms if calibrated else set())
+    """Parameters that are judged by what is known of them. Terms that nobody has stated are what they are: those of
+    distortion of a lens that is not calibrated, or that the model of its camera file lacks."""
+    return {"f", "cx", "cy"} | {name for name, one in parameters.items() if one.prior != 0.0}
