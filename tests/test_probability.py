@@ -111,15 +111,16 @@ def test_there_is_a_weight_for_every_column() -> None:
 
 def test_the_least_probability_rises_until_as_many_are_expected_to_be_right() -> None:
     likely = [np.array([0.99, 0.86, 0.94]), None, np.array([0.93, 0.5, 0.92])]
-    kept = lambda expected: least_probability(likely, 0.85, expected, 0.93)  # noqa: E731
+    kept = lambda expected: least_probability(likely, 0.85, expected, 0.4)  # noqa: E731
     assert kept(0.0) == kept(0.927) == 0.85  # the mean of the five is 0.928
     assert kept(0.93) == 0.92  # of four 0.945
     assert kept(0.95) == 0.93  # of three 0.9533
-    assert kept(0.96) == 0.93  # of two 0.965, from 0.94 on
+    assert kept(0.96) == 0.93  # of two 0.965, but two fifths of the five are given up at most
 
 
 def test_the_least_probability_rises_no_farther_than_it_may() -> None:
     """Else nothing would be left of images without third ones."""
-    assert least_probability([np.full(40, 0.9)], 0.85, 0.985, 0.93) == 0.9
-    assert least_probability([np.array([0.96, 0.97, 0.98])], 0.85, 0.985, 0.93) == 0.93
+    assert least_probability([np.full(40, 0.9)], 0.85, 0.985, 0.15) == 0.9
+    assert least_probability([np.linspace(0.86, 0.96, 11)], 0.85, 0.985, 0.2) == pytest.approx(0.88)
+    assert least_probability([np.linspace(0.86, 0.96, 11)], 0.85, 0.985, 1.0) == pytest.approx(0.96)
     assert least_probability([None], 0.85, 0.985, 0.93) == 0.85

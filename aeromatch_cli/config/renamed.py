@@ -31,6 +31,7 @@ SETTINGS: Mapping[str, Mapping[str, Mapping[str, str]]] = {
         "clustered-ransac": {"support": "min_support"},
         "epipolar": {"narrowest_px": "min_band_px"},
     },
+    "consistency": {"block": {"raised_up_to": "most_given_up"}},
 }
 # Section -> old name of a strategy -> new name.
 STRATEGIES: Mapping[str, Mapping[str, str]] = {"extract": {"lattice": "grid"}}

@@ -85,7 +85,7 @@ def lens_prior(camera: Camera, focal_sigma: float) -> LensPrior:
     if is_fisheye(camera):
         sigmas |= {"p1": _RADIAL / radius**8, "p2": 0.0, "b2": 0.0}
     if stated:
-        # SIMPLE_RADIAL says nothing of decentring, and a principal point in the middle is one that nobody has looked for.
+        # SIMPLE_RADIAL says nothing of decentring; a principal point in the middle is one that nobody has looked for.
         known = _terms(camera) - ({"cx", "cy"} if centred else set())
         sigmas |= {name: _STATED * sigmas[name] for name in known}
     sigmas["f"] = focal_sigma * focal
@@ -104,8 +104,8 @@ def freed(prior: LensPrior, calibration: Calibration, switches: Mapping[str, boo
     """Return the standard deviations (12,) of the unknowns, 0 where one is held.
 
     calibration: "given" holds all, "focal" all but the focal length; "brown" frees all, whatever the block says of
-    them; "auto" leaves it to the adjustment, but for a skew that nobody has stated. switches: by name, what is free or held in any case. images: that the
-    camera has taken.
+    them; "auto" leaves it to the adjustment, but for a skew that nobody has stated. switches: by name, what is free or
+    held in any case. images: that the camera has taken.
     """
     free = np.zeros(len(LENS), dtype=bool)
     if calibration != "given" and images >= _FOCAL_IMAGES:
