@@ -11,8 +11,17 @@ from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.lenses import remark
 from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.data import Camera
-from aeromatch_cli.geometry.cameras import BROWN, FISHEYE, MODELS, as_brown, from_colmap, normalise, pixels_of_rays
-from aeromatch_cli.geometry.lenses import Nearest, brown, fisheye, in_colmap, nearest_of, of_colmap
+from aeromatch_cli.geometry.cameras import (
+    BROWN,
+    FISHEYE,
+    MODELS,
+    as_brown,
+    colmap_camera,
+    from_colmap,
+    normalise,
+    pixels_of_rays,
+)
+from aeromatch_cli.geometry.lenses import Nearest, brown, fisheye, in_colmap, in_colmaps_mappers, nearest_of, of_colmap
 
 SIZE = (4000, 3000)
 FOCAL = (3000.0, 3010.0)
@@ -114,6 +123,18 @@ def test_the_nearest_camera_without_some_parameters() -> None:
     simple = from_colmap("RADIAL", *SIZE, (3000.0, 2000.0, 1500.0, -0.1, 0.02))
     assert nearest_of(simple, ("f", "k1", "k2")) == Nearest(as_brown(simple))
     assert in_colmap(simple) == Nearest(simple)
+
+
+def test_mappers_of_colmap_get_no_terms_that_divide() -> None:
+    found = in_colmaps_mappers(FULL)
+    assert found.camera is not None
+    assert colmap_camera(found.camera)[0] == "OPENCV"
+    # At the corner k3 moves by 3000 * 0.02 * r^7 = 13 px, most of which k1 and k2 take over.
+    assert 0.1 < found.misfit_px < found.worst_px < 2.0
+    simple = from_colmap("OPENCV", *SIZE, (3000.0, 3010.0, 2000.0, 1500.0, -0.1, 0.02, 1e-3, 0.0))
+    fisheye_lens = Camera(FISHEYE, *SIZE, (1300.0, 1300.0, 1999.5, 1499.5, 0.01, 0.0, 0.001, 0.0))
+    assert in_colmaps_mappers(simple) == Nearest(simple)
+    assert in_colmaps_mappers(fisheye_lens) == Nearest(fisheye_lens)
 
 
 def test_a_strong_fisheye_is_far_from_other_models_and_says_so() -> None:

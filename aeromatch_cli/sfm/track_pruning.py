@@ -15,7 +15,8 @@ JudgedPair = tuple[str, str, IntArray, BoolArray]
 
 
 def without_dropped(adjusted: AdjustedBlock, pairs: Iterable[JudgedPair]) -> AdjustedBlock:
-    """Return the block with the points and observations that the kept matches hold; poses and cameras stay.
+    """Return the block with the points and observations that the kept matches hold; poses and cameras stay, and the
+    errors of points, which geometry.reprojection finds anew.
 
     A point that lost a match keeps the largest part of its observations that kept matches still tie to each other, and
     goes where none ties two. Points that lost no match stay as they are. pairs: all with verified matches.

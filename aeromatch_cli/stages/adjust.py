@@ -36,7 +36,7 @@ from aeromatch_cli.stages.surveyed import control_of_block, control_remarks, cou
 from aeromatch_cli.stages.unregistered import unregistered_reasons
 from aeromatch_cli.stages.versions import library_version
 
-VERSION = 30
+VERSION = 31
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 _NOTHING = "not done: no image is oriented; exports have poses only where some are given"

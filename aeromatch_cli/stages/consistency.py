@@ -31,7 +31,7 @@ from aeromatch_cli.stages.state import BlockState, Judged
 from aeromatch_cli.store.matches import FinalEntries
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 
-VERSION = 7
+VERSION = 8
 
 
 def run(context: Context) -> StageReport:

@@ -45,7 +45,7 @@ from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 
 # The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
-VERSION, _LARGE_BLOCK_VERSION = 29, 1
+VERSION, _LARGE_BLOCK_VERSION = 30, 1
 _DATA = "orientation/orientation.json"
 # What failures.csv calls the mapper's process.
 _MAPPING = "mapping"
