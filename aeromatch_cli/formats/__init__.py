@@ -290,10 +290,10 @@ line per pair), `conditions.csv`, plots as PNG.
 `database.db` and `sparse/{cameras,images,points3D}.txt` in COLMAP's own formats and pixel frame (this workspace's plus
 0.5). `sparse/` holds the adjusted block: cameras, oriented images with their keypoints, and triangulated points with
 their tracks; without adjustment the poses of the orientation, or those given, alone. The pose priors of the database
-are the given positions. Cameras of the database are those that COLMAP's mappers can refine: the nearest OPENCV where the
-lens has k3 or skew. `orientation.csv`: as above; `residuals.csv` too, with the points that final matches hold.
-`world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here plus the origin; `unit`: `m`, or `arbitrary` in a
-frame of the pictures' own.
+are the given positions. Cameras of the database are those that COLMAP's mappers can refine: the nearest OPENCV where
+the lens has k3 or skew. `orientation.csv`: as above; `residuals.csv` too, with the points that final matches hold.
+`world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here plus the origin; `unit`: `m`, or `arbitrary`
+in a frame of the pictures' own.
 
 Groups of images whose place beside each other is not known are models of their own. `sparse/` holds what positions have
 placed in the world, else the largest group; `sparse_own2/` is the model of the images with the frame `own 2` in

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import figures, options
+from benchmarks.processes import children_seconds
 from benchmarks.sources import code_digest
 from benchmarks.stamps import REPOSITORY
 
@@ -89,7 +90,7 @@ def main(arguments: Sequence[str]) -> int:
             given[word] = _text(folder)
     failed = []
     for name in args.only:
-        standing, started = STANDING[name], time.monotonic()
+        standing, started, used_s = STANDING[name], time.monotonic(), children_seconds()
         print(f"# {name}" + ("" if args.quick else f": about {standing.minutes} minutes"), flush=True)
         for run in standing.runs:
             if "ANCHORS" in shlex.split(run) and "ANCHORS" not in given:
@@ -100,7 +101,8 @@ def main(arguments: Sequence[str]) -> int:
             if not args.list and _run(asked):
                 failed.append(shlex.join(["scripts/bench", *asked]))
         if not args.list:
-            print(f"# {name}: {(time.monotonic() - started) / 60.0:.1f} minutes", flush=True)
+            wall, processor = (time.monotonic() - started) / 60.0, (children_seconds() - used_s) / 60.0
+            print(f"# {name}: {wall:.1f} minutes, {processor:.1f} of the processor", flush=True)
     if args.docs and not args.list:
         figures.write_readme()
     for command in failed:

@@ -43,7 +43,7 @@ METHODS = "auto,baseline,fusion,oblique,polar,pycolmap-guided"
 # The conditions under which a strategy may help; both sections share the runs of `auto`.
 STRATEGY_PLACES = "city:mixed,city:exposed,city:oblique,grass:nadir"
 # What is open; docs/decisions.md says what others brought.
-STRATEGIES = "cascade.learned.lightglue=false,match=lightglue"
+STRATEGIES = "cascade.learned.lightglue=false"
 
 
 def _rendered(section: str, arguments: Sequence[str]) -> None:
@@ -93,7 +93,7 @@ def _real(arguments: Sequence[str]) -> None:
     add = parser.add_argument
     add("--data", type=Path, required=True, metavar="DIR", help="folder of blocks")
     add("--blocks", type=options.names, default="ochota,lewis,seneca,brighton", help="names, comma-separated")
-    add("--thin", type=options.numbers, default="3,4", help="keep every k-th image; several k comma-separated")
+    add("--thin", type=options.numbers, default="4", help="keep every k-th image; several k comma-separated")
     add("--given", type=options.names, default="positions,nothing", help=f"of {', '.join(real.GIVEN)}")
     add("--presets", type=split_methods, default=JUDGED, help="comma-separated")
     add("--keypoints", type=options.positive, default=4000, help="SIFT descriptors per image")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import numpy as np
 
@@ -35,11 +34,16 @@ HEADS = (
 
 
 def measured(args: argparse.Namespace, methods: Sequence[str]) -> Iterator[list[Row]]:
-    """Rows of every method on every block that it is asked for; --jobs methods run at a time, on one core each."""
+    """Rows of every method on every block that it is asked for; --jobs methods run at a time, on one core each, while
+    the next blocks are rendered."""
     with ThreadPoolExecutor(args.jobs) as pool:
-        for block, judged in asked_blocks(args):
-            asked = [name for name in methods if block.nadir or parse_method(name)[0] != NADIR_ONLY]
-            yield from pool.map(partial(rows_of, args, block, judged), asked)
+        running = [
+            pool.submit(rows_of, args, block, judged, name)
+            for block, judged in asked_blocks(args)
+            for name in methods
+            if block.nadir or parse_method(name)[0] != NADIR_ONLY
+        ]
+        yield from (run.result() for run in running)
 
 
 def by_block(rows: Sequence[Row]) -> Mapping[str, list[Row]]:
