@@ -78,7 +78,18 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
         ),
         (
             {"adjust": {"groups": [LEVEL]}, "orient": {"models": [{"contradiction": "scattered"}]}},
-            ["bad: none of the 4 given positions is used, the pictures contradict them"],
+            ["bad: none of the 4 given positions is used, the pictures contradict them: check the coordinate system"],
+        ),
+        (
+            {
+                "adjust": {"groups": [LEVEL]},
+                "orient": {
+                    "models": [{"contradiction": "scattered"}],
+                    "images_matched": 4,
+                    "by_ground": ["a", "b", "c"],
+                },
+            },
+            ["bad: none of the 4 given positions", "though 3 of 4 images are oriented by a single pair each"],
         ),
         (
             {"filter": {"components": [2, 2]}, "adjust": {"groups": [PLACED, {"kind": "level", "images": 2}]}},

@@ -144,8 +144,6 @@ def open_dem(
     from rasterio.errors import RasterioError
 
     if len(positions_m) == 0:
-        if not path.exists():
-            raise ConfigError(f"--ground {path}: no such file, and no number: give metres, a DEM or auto")
         raise ConfigError(f"the DEM {path} needs image positions to find the block on it; give poses or a constant")
     try:
         check_given(path)

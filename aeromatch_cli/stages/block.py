@@ -19,6 +19,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from aeromatch_cli.blocks.control import read_control
+from aeromatch_cli.blocks.control_files import opened_survey
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, checked_heights, world_crs
 from aeromatch_cli.blocks.doubles import doubles
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
@@ -38,7 +39,7 @@ from aeromatch_cli.images.masks import mask_path
 from aeromatch_cli.images.remote import RemoteFile, is_remote, list_remote, on_disk
 from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.stages.context import Given
-from aeromatch_cli.stages.ground import given_ground, ground_fingerprint
+from aeromatch_cli.stages.ground import check_ground, given_ground, ground_fingerprint
 from aeromatch_cli.store.index import Index
 from aeromatch_cli.workspace import FORMAT_VERSION, Workspace
 
@@ -173,6 +174,9 @@ def _check_given(settings: Settings, workspace: Workspace) -> None:
         checked_crs(world_crs(given.crs))
     if not _is_auto(given.heights):
         checked_heights(given.heights)
+    check_ground(given.ground)
+    for survey in filter(None, (given.gcp, given.gcp_marks)):
+        opened_survey(Path(survey))
     if given.masks and not (Path(given.masks).is_dir() or Path(given.masks).is_file()):
         what = "are neither a folder nor a file" if Path(given.masks).exists() else "do not exist"
         raise ConfigError(f"masks {given.masks} {what}: give a folder of masks, or one mask, with --masks")

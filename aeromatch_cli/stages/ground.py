@@ -45,13 +45,20 @@ def ground_fingerprint(settings: Settings) -> str:
     return f"{text} {image_fingerprint(Path(text))}" if Path(text).is_file() else text
 
 
+def check_ground(text: str) -> None:
+    """Raise ConfigError for a ground that is no height, no file and not `auto`."""
+    z_m = stated_height_m(text)
+    if z_m is not None and not abs(z_m) <= _FARTHEST_M:
+        raise ConfigError(f"--ground {text}: no height in metres; give one, a DEM or auto")
+    if z_m is None and text != "auto" and not Path(text).exists():
+        raise ConfigError(f"--ground {text}: no such file, and no number: give metres, a DEM or auto")
+
+
 def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None, str, tuple[str, ...]]:
     """Return the ground that settings or the camera file state, where it comes from in words, and remarks; else
     None."""
     text = settings.block.ground
     if (z_m := stated_height_m(text)) is not None:
-        if not abs(z_m) <= _FARTHEST_M:
-            raise ConfigError(f"--ground {text}: no height in metres; give one, a DEM or auto")
         return ConstantGround(z_m - inputs.origin_m[2]), f"given: {z_m:g} m", ()
     if text != "auto":
         positions = np.array([pose.center_m for pose in inputs.poses.values()]).reshape(-1, 3)

@@ -12,7 +12,7 @@ from aeromatch_cli.blocks.pose_files.source import Source
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes
 
-__all__ = ["Mark", "Survey", "SurveyedPoint", "read_survey"]
+__all__ = ["Mark", "Survey", "SurveyedPoint", "opened_survey", "read_survey"]
 
 # Files that may hold the other half, by the ends of their names; larger ones are something else.
 _SUFFIXES, _LARGEST_BYTES = (".csv", ".txt", ".xml"), 20_000_000
@@ -55,14 +55,15 @@ def read_survey(path: Path, marks: Path | None, usual_crs: str | None = None) ->
 
 
 def _read(path: Path, usual_crs: str | None) -> Survey:
-    source = _opened(path)
+    source = opened_survey(path)
     known = next((one for one in _FORMATS if one.recognises(source)), None)
     if known is _COORDINATES:
         return tables.read_coordinates(source, usual_crs)
     return odm.read_gcp_list(source) if known is None else known.read(source)
 
 
-def _opened(path: Path) -> Source:
+def opened_survey(path: Path) -> Source:
+    """The text of a file of control points. Raises ConfigError where the file cannot be read, or is none of text."""
     other = next((words for end, words in _OTHERS.items() if path.name.lower().endswith(end)), "")
     if other and path.is_file():
         raise ConfigError(f"control points {path} are {other}, with label, x, y, z or label, lat, lon, alt")

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from aeromatch_cli.results.stages import OrientResult
 from aeromatch_cli.sfm.quality.finding import (
     WRONG_POSITIONS,
     Finding,
@@ -107,11 +108,7 @@ def frames(evidence: QualityInput) -> Found:
         )
         yield Finding("positions", 1.0, WRONG_POSITIONS[0], "bad", words)
     elif given >= _HOLDING:
-        words = (
-            f"none of the {given} given positions is used, the pictures contradict them: check the coordinate "
-            "system, the order of x and y, and which position belongs to which image"
-        )
-        yield Finding("positions", 1.0, WRONG_POSITIONS[0], "bad", words)
+        yield Finding("positions", 1.0, WRONG_POSITIONS[0], "bad", _contradicted_words(given, orient))
     else:
         what = "the given position is" if given == 1 else f"the {given} given positions are"
         enough = f"{what} not enough, those (--poses) of three images that are oriented together are"
@@ -120,6 +117,19 @@ def frames(evidence: QualityInput) -> Found:
             f"{enough if given else 'positions (--poses) do'}; control points alone show how the block is to be moved"
         )
         yield Finding("ground", None, None, "doubtful", words)
+
+
+def _contradicted_words(given: int, orient: OrientResult | None) -> str:
+    """Say that the pictures contradict all given positions, and what to look at. An orientation by single pairs, which
+    no third image checks, may be the wrong one of both."""
+    words = f"none of the {given} given positions is used, the pictures contradict them"
+    tied = 0 if orient is None else len({*orient.by_ground, *orient.by_one_pair})
+    if orient is not None and 2 * tied > orient.images_matched:
+        return (
+            f"{words}, though {tied} of {counted(orient.images_matched, 'image')} are oriented by a single pair each, "
+            "which no third image checks: more overlap tells which of both is wrong; orient=given keeps the given poses"
+        )
+    return f"{words}: check the coordinate system, the order of x and y, and which position belongs to which image"
 
 
 def weak_ties(evidence: QualityInput) -> Found:
