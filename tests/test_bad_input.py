@@ -273,10 +273,13 @@ def test_wrong_arguments_name_themselves(site, arguments, words):
         (["--crs", "EPSG:99999"], "crs 'EPSG:99999' is unknown"),
         (["--crs", "EPSG:4326"], "is not projected"),
         (["--set", "block.heights=EPSG:32633"], "heights 'EPSG:32633' are unknown"),
-        (["--ground", "none.tif"], "--ground none.tif: no such file, and no number"),
-        (["--ground", "2e6"], "--ground 2e6: no height in metres"),
-        (["--gcp", "none.txt"], "control points none.txt cannot be read (No such file or directory)"),
-        (["--set", "block.gcp_marks=none.csv"], "control points none.csv cannot be read"),
+        (["--ground", "none.tif"], "none.tif: no such file, and no number: give metres, a DEM or auto"),
+        (["--ground", "2e6"], "--ground 2e6: no height of any ground"),
+        (["--gcp", "none.txt"], "none.txt cannot be read (No such file or directory): give ODM's gcp_list.txt"),
+        (
+            ["--gcp", __file__, "--gcp-marks", "none.csv"],
+            "none.csv cannot be read (No such file or directory): give a table of image, label",
+        ),
     ],
 )
 def test_what_is_wrong_with_any_images_is_refused_before_the_images_are_read(site, arguments, words, monkeypatch):

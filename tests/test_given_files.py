@@ -64,7 +64,9 @@ def test_a_camera_file_with_an_endless_number(tmp_path: Path) -> None:
 def test_heights_that_are_none(ground: str, site: Site) -> None:
     outcome = site("pairs", "--ground", ground)
     assert outcome.code == 2
-    assert outcome.stderr.endswith(f"error: --ground {ground}: no height in metres; give one, a DEM or auto\n")
+    assert outcome.stderr.endswith(
+        f"error: --ground {ground}: no height of any ground, in metres; give one, a DEM or auto\n"
+    )
 
 
 def test_more_jobs_than_any_machine_has(site: Site) -> None:

@@ -161,7 +161,7 @@ def open_dem(
             margin = float(np.clip(reach, *_MARGIN_M))
             heights, transform, codes = _read_extent(dataset, frames, low - margin, high + margin, _MAX_CELLS, unit_m)
     except (RasterioError, OSError) as error:
-        said = getattr(error, "strerror", None) or error
+        said = getattr(error, "strerror", None) or str(error).rstrip(".")
         raise ConfigError(f"cannot read the DEM {path}: {said}; give a GeoTIFF of heights or a constant") from error
     if codes:
         named = listed(f"{code:g}" for code in codes)

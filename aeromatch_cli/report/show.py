@@ -331,7 +331,7 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     verdict = found.verdict
     kept = found.matches if verdict.state == "verified" else None
     count = 0 if kept is None else len(kept.indices)
-    lines.append(f"matches     {len(raw.matches.indices)} by {raw.strategy}, {count} verified: {verdict.state}")
+    lines.append(f"matches     {len(raw.matches.indices):,} by {raw.strategy}, {verdict.state}: {count:,} verified")
     sides = [work.keypoints_px(i) for i in ids]
     points = match_points(kept, *sides) if kept is not None else (np.zeros((0, 2)), np.zeros((0, 2)))
     lines += [*_verdict_of_pair(verdict), *_adjusted_lines(work, ids, points), *_pass_lines(workspace, ids)]

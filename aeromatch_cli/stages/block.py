@@ -175,8 +175,10 @@ def _check_given(settings: Settings, workspace: Workspace) -> None:
     if not _is_auto(given.heights):
         checked_heights(given.heights)
     check_ground(given.ground)
-    for survey in filter(None, (given.gcp, given.gcp_marks)):
-        opened_survey(Path(survey))
+    if given.gcp:
+        opened_survey(Path(given.gcp))
+    if given.gcp_marks:
+        opened_survey(Path(given.gcp_marks), marks=True)
     if given.masks and not (Path(given.masks).is_dir() or Path(given.masks).is_file()):
         what = "are neither a folder nor a file" if Path(given.masks).exists() else "do not exist"
         raise ConfigError(f"masks {given.masks} {what}: give a folder of masks, or one mask, with --masks")

@@ -49,7 +49,7 @@ def check_ground(text: str) -> None:
     """Raise ConfigError for a ground that is no height, no file and not `auto`."""
     z_m = stated_height_m(text)
     if z_m is not None and not abs(z_m) <= _FARTHEST_M:
-        raise ConfigError(f"--ground {text}: no height in metres; give one, a DEM or auto")
+        raise ConfigError(f"--ground {text}: no height of any ground, in metres; give one, a DEM or auto")
     if z_m is None and text != "auto" and not Path(text).exists():
         raise ConfigError(f"--ground {text}: no such file, and no number: give metres, a DEM or auto")
 

@@ -62,18 +62,19 @@ def _read(path: Path, usual_crs: str | None) -> Survey:
     return odm.read_gcp_list(source) if known is None else known.read(source)
 
 
-def opened_survey(path: Path) -> Source:
-    """The text of a file of control points. Raises ConfigError where the file cannot be read, or is none of text."""
+def opened_survey(path: Path, *, marks: bool = False) -> Source:
+    """The text of a file of control points; marks: of their image measurements alone. Raises ConfigError where the file
+    cannot be read, or is none of text."""
     other = next((words for end, words in _OTHERS.items() if path.name.lower().endswith(end)), "")
     if other and path.is_file():
         raise ConfigError(f"control points {path} are {other}, with label, x, y, z or label, lat, lon, alt")
     try:
         given_bytes(path)
     except OSError as error:
-        raise ConfigError(
-            f"control points {path} cannot be read ({error.strerror}): give ODM's gcp_list.txt, or a file of Pix4D or "
-            "Metashape"
-        ) from error
+        what, remedy = "control points", "give ODM's gcp_list.txt, or a file of Pix4D or Metashape, with --gcp"
+        if marks:
+            what, remedy = "image measurements", "give a table of image, label, x and y with --gcp-marks"
+        raise ConfigError(f"{what} {path} cannot be read ({error.strerror}): {remedy}") from error
     source = Source(path)
     if source.raw and not source.text:
         raise ConfigError(f"control points {path} are a binary file: give a text file or XML")
