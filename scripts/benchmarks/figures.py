@@ -83,7 +83,7 @@ RESULTS: Sequence[Result] = (
         "scripts/bench peers",
     ),
     Result(
-        "Simulated blocks of 24 images with real lenses of which EXIF tells the focal length alone",
+        "Simulated blocks of 24 images, lenses like real ones of which EXIF tells the focal length alone",
         "check points {horizontal} px off horizontally and {height} px in height; true over stated errors {stated}",
         {
             "horizontal": Figure("bench_calibration", "horizontal, px", _OURS),
