@@ -37,7 +37,7 @@ class Preset:
             own.append("simulate.far_ground=false")
         places = scene.images, scene.poses, scene.block, work / "work"
         chosen = prepared(preset, own, *places, seed=options.seed)
-        names = {image.image_id: image.name for image in chosen.block.images}
+        names = chosen.block.names
         both = {(names[pair.image_id0], names[pair.image_id1]) for pair in chosen.pairs} | set(scene.pairs)
         listed = work / "pairs.txt"
         listed.write_text("".join(f"{a},{b}\n" for a, b in sorted(both)), encoding="utf-8")
