@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import BlockTruth, Conditions
-from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
+from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
 from aeromatch_cli.files import write_json
 from aeromatch_cli.fingerprints import fingerprint, stable_hash
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap
@@ -38,6 +39,10 @@ CONDITIONS = {
     "all": (HARD, EASY),
     "angles": tuple(name for name, _ in reversed(VIEW_ANGLE_CLASSES)),
 }
+# Classes of real pairs, each judged by itself: the view angle, or that the images have different exposures.
+REAL_ANGLES = (("0-25", 25.0), ("25-40", 40.0), ("40-60", 60.0), (">60", math.inf))
+TWO_EXPOSURES = "two exposures"
+REAL_CLASSES = (*(name for name, _ in REAL_ANGLES), TWO_EXPOSURES)
 EXACT_POSES, NOISY_POSES = "poses.csv", "poses_noisy.csv"
 
 
@@ -53,7 +58,7 @@ class Selection:
 
 @dataclass(frozen=True)
 class JudgedPair:
-    """A pair and what makes it hard. condition: "hard" or "easy"."""
+    """A pair and what makes it hard. condition: "hard" or "easy", or of `real_blocks` one of REAL_CLASSES."""
 
     images: tuple[str, str]
     condition: str
@@ -102,14 +107,44 @@ def judged_block(name: str, folder: Path, selection: Selection) -> Judged:
 
 def real(folder: Path, data: Path, block: str, selection: Selection, *, max_size_px: int) -> Judged:
     """A shared block with reference poses, its images reduced once to at most max_size_px."""
+    out = _reduced(folder, data, block, max_size_px)
+    return _judged(block, out, open_truth(out), selection, _differently_bright(out / "images"))
+
+
+def real_blocks(
+    folder: Path, data: Path, blocks: Sequence[str], per_class: int, seed: int, *, max_size_px: int
+) -> list[Judged]:
+    """Shared blocks with `per_class` pairs of each of REAL_CLASSES, the blocks in turn; fewer where there are no more.
+
+    A pair under two exposures counts there alone, whatever its view angle.
+    """
+    places = {block: _reduced(folder, data, block, max_size_px) for block in blocks}
+    truths = {block: open_truth(out) for block, out in places.items()}
+    members: dict[str, list[tuple[float, str, JudgedPair]]] = {kind: [] for kind in REAL_CLASSES}
+    for block, truth in truths.items():
+        bright = _differently_bright(places[block] / "images")
+        rng = np.random.default_rng([seed, stable_hash(block) % (1 << 32)])
+        seen = overlapping(truth)
+        ranks = dict.fromkeys(REAL_CLASSES, 0)
+        for i in rng.permutation(len(seen)):
+            images, found = list(seen.items())[i]
+            kind = TWO_EXPOSURES if images in bright else class_of(found.view_angle_deg, REAL_ANGLES)
+            members[kind].append((ranks[kind], block, JudgedPair(images, kind, found)))
+            ranks[kind] += 1
+    taken = [one for those in members.values() for one in sorted(those, key=lambda one: one[0])[:per_class]]
+    chosen_of = {block: tuple(pair for _, of, pair in taken if of == block) for block in blocks}
+    return [_of_pairs(block, places[block], truths[block], chosen_of[block]) for block in blocks if chosen_of[block]]
+
+
+def _reduced(folder: Path, data: Path, block: str, max_size_px: int) -> Path:
+    """Folder of a shared block's reduced copy, made unless it is there."""
     source = data / block
     if not (source / "reference" / "poses.csv").is_file():
         raise ConfigError(f"{source} is no block with reference poses: give --data and --blocks of such a folder")
     out = folder / f"{block}-{max_size_px}"
     if not (out / "block.json").is_file():
         _reduce(source, out, max_size_px)
-    truth = open_truth(out)
-    return _judged(block, out, truth, selection, _differently_bright(out / "images"))
+    return out
 
 
 def _judged(name: str, out: Path, truth: BlockTruth, selection: Selection, hard: set[tuple[str, str]]) -> Judged:
@@ -118,7 +153,10 @@ def _judged(name: str, out: Path, truth: BlockTruth, selection: Selection, hard:
     candidates = [JudgedPair(images, kinds[images], found) for images, found in seen.items()]
     # Streams of their own, so that one scene's pairs do not depend on which others are judged.
     rng = np.random.default_rng([selection.seed, stable_hash(name) % (1 << 32)])
-    pairs = chosen(candidates, selection, rng)
+    return _of_pairs(name, out, truth, chosen(candidates, selection, rng))
+
+
+def _of_pairs(name: str, out: Path, truth: BlockTruth, pairs: tuple[JudgedPair, ...]) -> Judged:
     listed = tuple(pair.images for pair in pairs)
     scene = Scene(name, out / "images", out / EXACT_POSES, out / "block.json", truth.cameras, listed)
     return Judged(scene, truth, pairs, _key(scene))

