@@ -55,7 +55,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_method_is_judged_on_the_same_pairs(done: Path) -> None:
     rows = rows_of(done)
-    pairs = {name: [(row["pair"], row["view_angle"]) for row in rows if row["method"] == name] for name in METHODS}
+    pairs = {name: [(row["pair"], row["class"]) for row in rows if row["method"] == name] for name in METHODS}
     assert all(pairs[name] == pairs["opencv-sift"] for name in METHODS)
     assert len(set(pairs["opencv-sift"])) == PAIRS
     for row in rows:
@@ -65,7 +65,7 @@ def test_every_method_is_judged_on_the_same_pairs(done: Path) -> None:
 
 
 def test_good_methods_do_well_on_pairs_from_alike_directions(done: Path) -> None:
-    easy = [row for row in rows_of(done) if row["view_angle"] == "0-20"]
+    easy = [row for row in rows_of(done) if row["class"] == "0-20"]
     assert easy
     for name in METHODS:
         own = [row for row in easy if row["method"] == name]
@@ -176,7 +176,7 @@ def test_published_matchers_take_their_weights_by_either_name_and_places_as_they
 def test_lines_hold_sums_and_the_first_method_beside() -> None:
     def row(method: str, pair: str, correct: int, kept: int) -> Row:
         figures = {"correct": correct, "kept": kept, "possible": 200, "median_error_px": 0.4, "seconds": 2.0}
-        return {"method": method, "scene": "city", "pair": pair, "view_angle": "40-60", **figures}
+        return {"method": method, "scene": "city", "pair": pair, "class": "40-60", **figures}
 
     rows = [row("oblique", "a b", 100, 110), row("oblique", "a c", 20, 20)]
     rows += [row("SIFT", "a b", 40, 80), row("SIFT", "a c", 0, 0)]
