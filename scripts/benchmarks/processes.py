@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import resource
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,9 +20,11 @@ _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def limit_threads(threads: int) -> None:
-    """For this process and those started from it; numerical libraries read it when they are loaded."""
+    """For this process and those started from it; numerical libraries read it when they are loaded, torch is told."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = str(threads)
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(threads)
     os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
 
 

@@ -32,7 +32,8 @@ class Preset:
         self._folder = tempfile.TemporaryDirectory()  # lives as long as this object
         work = Path(self._folder.name)
         budget = [] if options.budget == "image" else [f"extract.budget={options.budget}"]
-        own = [f"extract.keypoints={options.keypoints}", *budget, *settings]
+        # After the settings: a strategy that they name has its own default of keypoints.
+        own = [*settings, f"extract.keypoints={options.keypoints}", *budget]
         if hasattr(load(preset, own).simulate, "far_ground") and not any("far_ground" in one for one in settings):
             own.append("simulate.far_ground=false")
         places = scene.images, scene.poses, scene.block, work / "work"
