@@ -81,6 +81,11 @@ class ReferenceTruth:
         """Camera of every image, by name."""
         return self._sight.cameras
 
+    @property
+    def poses(self) -> Mapping[str, Pose]:
+        """Pose of every image, by name, around the origin of the reference's frame."""
+        return self._sight.poses
+
     def near(self, name: str, others: Sequence[str]) -> BoolArray:
         """Which of the others (N,) may show some of the same ground; the rest share nothing."""
         return self._overlaps.near(name, others)

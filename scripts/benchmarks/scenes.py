@@ -16,6 +16,7 @@ import numpy as np
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import BlockTruth, Conditions
+from aeromatch_cli.evaluate.reference import ReferenceTruth
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
 from aeromatch_cli.files import write_json
 from aeromatch_cli.fingerprints import fingerprint, stable_hash
@@ -26,7 +27,9 @@ from aeromatch_cli.lab.opening import open_truth
 from aeromatch_cli.lab.synthetic import render_block
 from benchmarks.options import size_px
 from benchmarks.peers.base import Scene
+from benchmarks.peers.heights import Heights
 from benchmarks.sources import code_digest
+from benchmarks.stamps import TRAINED_ON
 
 MIN_OVERLAP = 0.2
 # Mean grey level of one image over that of the other from which a pair of real images is hard.
@@ -39,10 +42,12 @@ CONDITIONS = {
     "all": (HARD, EASY),
     "angles": tuple(name for name, _ in reversed(VIEW_ANGLE_CLASSES)),
 }
-# Classes of real pairs, each judged by itself: the view angle, or that the images have different exposures.
+# Classes of real pairs, each judged by itself: the view angle, that the images have different exposures, or that a
+# network that ships has seen their block in training.
 REAL_ANGLES = (("0-25", 25.0), ("25-40", 40.0), ("40-60", 60.0), (">60", math.inf))
 TWO_EXPOSURES = "two exposures"
-REAL_CLASSES = (*(name for name, _ in REAL_ANGLES), TWO_EXPOSURES)
+TRAINING = "blocks of the training"
+REAL_CLASSES = (*(name for name, _ in REAL_ANGLES), TWO_EXPOSURES, TRAINING)
 EXACT_POSES, NOISY_POSES = "poses.csv", "poses_noisy.csv"
 
 
@@ -67,12 +72,14 @@ class JudgedPair:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A scene, who judges it, and its pairs. key: changes with the images, the truth and the choice of pairs."""
+    """A scene, who judges it, and its pairs. key: changes with the images, the truth and the choice of pairs. heights:
+    of the reference points, where truth is no more than poses."""
 
     scene: Scene
     truth: BlockTruth
     pairs: tuple[JudgedPair, ...]
     key: str
+    heights: Heights | None = None
 
 
 def render_once(folder: Path, preset: str, *, jobs: int = 2, **asked: Any) -> Path:
@@ -116,10 +123,11 @@ def real_blocks(
 ) -> list[Judged]:
     """Shared blocks with `per_class` pairs of each of REAL_CLASSES, the blocks in turn; fewer where there are no more.
 
-    A pair under two exposures counts there alone, whatever its view angle.
+    A pair of a block of the training, or under two exposures, counts there alone, whatever its view angle.
     """
     places = {block: _reduced(folder, data, block, max_size_px) for block in blocks}
     truths = {block: open_truth(out) for block, out in places.items()}
+    known = {block for blocks in TRAINED_ON.values() for block in blocks}
     members: dict[str, list[tuple[float, str, JudgedPair]]] = {kind: [] for kind in REAL_CLASSES}
     for block, truth in truths.items():
         bright = _differently_bright(places[block] / "images")
@@ -129,6 +137,7 @@ def real_blocks(
         for i in rng.permutation(len(seen)):
             images, found = list(seen.items())[i]
             kind = TWO_EXPOSURES if images in bright else class_of(found.view_angle_deg, REAL_ANGLES)
+            kind = TRAINING if block in known else kind
             members[kind].append((ranks[kind], block, JudgedPair(images, kind, found)))
             ranks[kind] += 1
     taken = [one for those in members.values() for one in sorted(those, key=lambda one: one[0])[:per_class]]
@@ -159,7 +168,8 @@ def _judged(name: str, out: Path, truth: BlockTruth, selection: Selection, hard:
 def _of_pairs(name: str, out: Path, truth: BlockTruth, pairs: tuple[JudgedPair, ...]) -> Judged:
     listed = tuple(pair.images for pair in pairs)
     scene = Scene(name, out / "images", out / EXACT_POSES, out / "block.json", truth.cameras, listed)
-    return Judged(scene, truth, pairs, _key(scene))
+    heights = Heights.of(out, truth) if isinstance(truth, ReferenceTruth) else None
+    return Judged(scene, truth, pairs, _key(scene), heights)
 
 
 def overlapping(truth: BlockTruth, least: float = MIN_OVERLAP) -> dict[tuple[str, str], Conditions]:
@@ -238,5 +248,6 @@ def _reduce(source: Path, out: Path, max_size_px: int) -> None:
         camera = from_colmap(lens["model"], lens["width"], lens["height"], tuple(lens["params"]))
         small = shrink_camera(camera, scale)
         lens.update(width=small.width_px, height=small.height_px, params=list(corner_params(small)))
-    shutil.copy(source / "reference" / "poses.csv", out / "poses.csv")
+    for name in ("poses.csv", "points.npz"):
+        shutil.copy(source / "reference" / name, out / name)
     write_json(out / "block.json", facts)  # last: it says that the rest is there

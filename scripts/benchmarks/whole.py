@@ -13,8 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from aeromatch_cli.config import Settings, load, parse_method
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.store.matches import match_points
+from aeromatch_cli.store.opened import OpenedBlock
 from benchmarks.tables import Row, plain
 
 # Of every judged pair, in what a truth or `evaluate` says of it.
@@ -106,6 +111,18 @@ def judged_run(
             for row in csv.DictReader(stream)
         }
     return rows, run.seconds
+
+
+def matches_of_run(work: Path) -> Mapping[tuple[str, str], tuple[FloatArray, FloatArray, FloatArray]]:
+    """Of the verified pairs of a workspace, by their two images: places (M, 2) in both, stored pixels, scores (M,)."""
+    block, found = OpenedBlock(work), {}
+    for pair in block.pairs:
+        entry = block.final(pair)
+        if entry is not None and entry.verdict.state == "verified":
+            ids = pair.image_id0, pair.image_id1
+            places = match_points(entry.matches, *(block.keypoints_px(number) for number in ids))
+            found[block.names[ids[0]], block.names[ids[1]]] = (*places, np.asarray(entry.matches.scores, np.float64))
+    return found
 
 
 def evaluated(work: Path, truth: Path, *, mapping: bool) -> dict[str, Any]:

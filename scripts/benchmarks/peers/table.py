@@ -10,6 +10,7 @@ from pathlib import Path
 
 from aeromatch_cli.config import Settings, load, parse_method, preset_names
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.strategies import Strategy
 from benchmarks.peers.aliked import ALIKED, ALIKED_ROTATED, Aliked
 from benchmarks.peers.base import Method, Options, Scene, weights_path
 from benchmarks.peers.colmap import Colmap
@@ -88,9 +89,21 @@ NEED_WEIGHTS = tuple(name for name in PEERS if _features_of(name) in _WEIGHTS)
 
 
 def missing_weights(spec: str, folder: Path | None) -> list[str]:
-    """Names of files without which a method cannot be run; folder: of reference weights."""
+    """Names of files without which a method cannot be run; folder: of reference weights. Those of a preset lie in the
+    weights folder, or in an installed package."""
+    if spec not in PEERS:
+        settings = load(*parse_method(spec))
+        return [f"the weights of {part.name}" for part in (settings.extract, settings.match) if not _has_weights(part)]
     files = _WEIGHTS.get(_features_of(spec), ())
     return [name for name in files if weights_path(folder, name) is None]
+
+
+def _has_weights(part: Strategy) -> bool:
+    try:
+        part.fingerprint_files()
+    except ConfigError:
+        return False
+    return True
 
 
 def reads_poses(spec: str) -> bool:
