@@ -16,11 +16,13 @@ from benchmarks import __main__, scenes
 from benchmarks.peers import base, command, ground, matching, published, table
 from benchmarks.peers.base import Options, Scene
 from benchmarks.peers.union import Union
+from benchmarks.whole import matches_of_run
 from conftest import HEIGHT, WIDTH, Site
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import Conditions
 from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.store.opened import OpenedBlock
 
 pytestmark = pytest.mark.slow
 
@@ -81,8 +83,11 @@ def test_a_second_run_makes_only_what_is_missing(done: Path) -> None:
     made = {path.name: path.stat().st_mtime_ns for path in answers[1:]}
     assert bench(done, *METHODS) == 0
     assert {path.name: path.stat().st_mtime_ns for path in answers[1:]} == made
-    without = [{key: value for key, value in row.items() if key != "seconds"} for row in rows_of(done)]
-    assert without == [{key: value for key, value in row.items() if key != "seconds"} for row in before]
+    assert [untimed(row) for row in rows_of(done)] == [untimed(row) for row in before]
+
+
+def untimed(row: Row) -> Row:
+    return {key: value for key, value in row.items() if key not in ("seconds", "matching_s")}
 
 
 def test_unknown_names_are_refused_with_the_choices(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -175,7 +180,14 @@ def test_published_matchers_take_their_weights_by_either_name_and_places_as_they
 
 def test_lines_hold_sums_and_the_first_method_beside() -> None:
     def row(method: str, pair: str, correct: int, kept: int) -> Row:
-        figures = {"correct": correct, "kept": kept, "possible": 200, "median_error_px": 0.4, "seconds": 2.0}
+        figures = {
+            "correct": correct,
+            "kept": kept,
+            "possible": 200,
+            "median_error_px": 0.4,
+            "seconds": 2.0,
+            "matching_s": 0.5,
+        }
         return {"method": method, "scene": "city", "pair": pair, "class": "40-60", **figures}
 
     rows = [row("oblique", "a b", 100, 110), row("oblique", "a c", 20, 20)]
@@ -256,6 +268,42 @@ def test_pairs_are_chosen_by_view_angle_and_large_angles_fill_up() -> None:
     found = scenes.chosen(pool, scenes.Selection("angles", 12, 0), np.random.default_rng(0))
     classes = [one.conditions.view_angle_class for one in found]
     assert {name: classes.count(name) for name in classes} == {"0-20": 3, "20-40": 1, "40-60": 3, ">60": 5}
+
+
+def test_real_pairs_are_of_each_class_and_blocks_of_the_training_stand_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pairs(*angles: float) -> dict[tuple[str, str], Conditions]:
+        return {(f"a{i:02}", f"b{i:02}"): Conditions(angle, 0.5, 0.0, 0.1) for i, angle in enumerate(angles)}
+
+    seen = {"one": pairs(*[10.0] * 9, *[30.0] * 2, *[50.0] * 4), "two": pairs(*[24.9] * 3, 70.0)}
+    seen["seneca"] = pairs(*[10.0] * 4, 70.0)
+    monkeypatch.setattr(scenes, "_reduced", lambda *given: tmp_path / given[2])
+    monkeypatch.setattr(scenes, "open_truth", lambda folder: folder.name)
+    monkeypatch.setattr(scenes, "overlapping", lambda name: seen[name])
+    bright = {("a00", "b00"), ("a12", "b12")}
+    monkeypatch.setattr(scenes, "_differently_bright", lambda images: bright if images.parent.name == "one" else set())
+    monkeypatch.setattr(scenes, "_of_pairs", lambda name, _out, _truth, taken: (name, taken))
+    found: Any = scenes.real_blocks(tmp_path, tmp_path, ["one", "two", "seneca"], 4, 0, max_size_px=800)
+    classes = {name: [pair.condition for pair in taken] for name, taken in found}
+    assert set(classes) == {"one", "two", "seneca"}
+    counted = {name: {kind: kinds.count(kind) for kind in set(kinds)} for name, kinds in classes.items()}
+    assert counted == {
+        "one": {"0-25": 2, "25-40": 2, "40-60": 3, "two exposures": 2},
+        "two": {"0-25": 2, ">60": 1},
+        "seneca": {"blocks of the training": 4},
+    }
+
+
+def test_matches_of_a_run_are_those_of_its_verified_pairs(done_site: Site) -> None:
+    block = OpenedBlock(done_site.work)
+    found = matches_of_run(done_site.work)
+    verified = {pair: block.final(pair) for pair in block.pairs}
+    verified = {pair: entry for pair, entry in verified.items() if entry and entry.verdict.state == "verified"}
+    assert len(found) == len(verified) > 0
+    for pair, entry in verified.items():
+        points0, points1, scores = found[block.names[pair.image_id0], block.names[pair.image_id1]]
+        assert len(points0) == len(points1) == len(scores) == len(entry.matches.scores)
 
 
 def test_nearest_neighbours_of_the_peers_are_exact() -> None:
@@ -340,7 +388,8 @@ def test_a_preset_with_further_steps_is_run_on_the_whole_block_once(
         return {pair.images: figures for pair in judged.pairs} | {("x", "y"): figures}, 30.0
 
     monkeypatch.setattr(command, "judged_run", run)
+    monkeypatch.setattr(command, "matches_of_run", lambda _: {})
     for _ in range(2):
         rows = list(command._of_run("auto", judged, base.Options(150, "image", 1, 0, None), tmp_path))
-        assert rows == [{**figures, "seconds": 30.0 / (len(judged.pairs) + 1)}] * len(judged.pairs)
+        assert rows == [{**figures, "seconds": 30.0 / (len(judged.pairs) + 1), "matching_s": None}] * len(judged.pairs)
     assert runs == ["auto"]

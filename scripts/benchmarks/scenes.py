@@ -168,7 +168,9 @@ def _judged(name: str, out: Path, truth: BlockTruth, selection: Selection, hard:
 def _of_pairs(name: str, out: Path, truth: BlockTruth, pairs: tuple[JudgedPair, ...]) -> Judged:
     listed = tuple(pair.images for pair in pairs)
     scene = Scene(name, out / "images", out / EXACT_POSES, out / "block.json", truth.cameras, listed)
-    heights = Heights.of(out, truth) if isinstance(truth, ReferenceTruth) else None
+    heights = None
+    if isinstance(truth, ReferenceTruth) and (out / "points.npz").is_file():
+        heights = Heights.of(out, truth)
     return Judged(scene, truth, pairs, _key(scene), heights)
 
 
@@ -248,6 +250,7 @@ def _reduce(source: Path, out: Path, max_size_px: int) -> None:
         camera = from_colmap(lens["model"], lens["width"], lens["height"], tuple(lens["params"]))
         small = shrink_camera(camera, scale)
         lens.update(width=small.width_px, height=small.height_px, params=list(corner_params(small)))
-    for name in ("poses.csv", "points.npz"):
-        shutil.copy(source / "reference" / name, out / name)
+    for path in (source / "reference" / "poses.csv", source / "reference" / "points.npz"):
+        if path.is_file():
+            shutil.copy(path, out / path.name)
     write_json(out / "block.json", facts)  # last: it says that the rest is there
