@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from pydantic import ValidationError
 from safetensors.torch import load_file, save_file
 from scipy.spatial import cKDTree
 
@@ -24,6 +23,7 @@ from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.stages.pairs import _check_descriptors
 from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.gradients import gradient_angles
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 
@@ -76,12 +76,14 @@ def test_budget_is_exact_and_runs_are_equal(picture: NDArray[np.uint8], settings
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 35.0, 90.0, 200.0])
-def test_matches_survive_turns_and_light(picture: NDArray[np.uint8], turn_deg: float) -> None:
+@pytest.mark.parametrize("orientation", ["network", "gradient"])
+def test_matches_survive_turns_and_light(picture: NDArray[np.uint8], turn_deg: float, orientation: str) -> None:
     middle = (SIDE - 1) / 2
     matrix = cv2.getRotationMatrix2D((middle, middle), turn_deg, 0.9)
     other = cv2.warpAffine(picture, matrix, (SIDE, SIDE), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
     darker = np.clip(0.6 * other.astype(np.float32) + 5.0, 0, 255).astype(np.uint8)
-    count, share = share_right(extract(picture), extract(darker), matrix)
+    sides = [extract(pixels, orientation=orientation) for pixels in (picture, darker)]
+    count, share = share_right(*sides, matrix)
     assert count >= 80
     assert share > 0.9
 
@@ -100,8 +102,15 @@ def test_angles_of_gradients_are_those_of_sift(picture: NDArray[np.uint8]) -> No
     turned = cv2.warpAffine(picture, matrix, (SIDE, SIDE), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
     _, share = share_right(found, extract(turned, detector="sift", orientation="gradient"), matrix)
     assert share > 0.9
-    with pytest.raises(ValidationError, match="orientation=gradient needs detector=sift"):
-        Learned(orientation="gradient")
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 33.0, 118.0, 270.0])
+def test_gradients_point_to_where_a_patch_is_brighter(angle_deg: float) -> None:
+    across, down = np.meshgrid(np.arange(32.0), np.arange(32.0))
+    ramp = across * np.cos(np.deg2rad(angle_deg)) + down * np.sin(np.deg2rad(angle_deg))
+    off = gradient_angles(ramp[None]) - angle_deg
+    assert abs((off[0] + 180.0) % 360.0 - 180.0) < 1.0  # a tenth of a bin
+    assert np.isfinite(gradient_angles(np.zeros((2, 32, 32), np.uint8))).all()
 
 
 def test_where_north_is_up_nothing_is_turned_unless_asked(picture: NDArray[np.uint8]) -> None:

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
@@ -27,6 +27,7 @@ from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.context import with_context
 from aeromatch_cli.strategies.extractors.described import Described, pixels_field
 from aeromatch_cli.strategies.extractors.detection import Raw, balanced, detect, sift_detector
+from aeromatch_cli.strategies.extractors.gradients import gradient_angles
 from aeromatch_cli.strategies.extractors.heat import heat_keypoints
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 
@@ -52,9 +53,8 @@ class Learned(Described):
     )
     orientation: Literal["auto", "network", "gradient", "upright"] = Field(
         "auto",
-        description="Rotate patches by the orientation network (network), by the gradients around SIFT's keypoints "
-        "(gradient; needs detector=sift), or not at all (upright). auto: by the network, upright in views that have "
-        "north up.",
+        description="Rotate patches by the orientation network (network), by the main direction of their gradients "
+        "(gradient), or not at all (upright). auto: by the network, upright in views that have north up.",
     )
     context: bool = Field(
         False,
@@ -72,12 +72,6 @@ class Learned(Described):
         "depend on it: set it explicitly for shards on different processors.",
     )
     device: Device = DEVICE
-
-    @model_validator(mode="after")
-    def _check_orientation(self) -> Learned:
-        if self.orientation == "gradient" and self.detector != "sift":
-            raise ValueError("orientation=gradient needs detector=sift: only SIFT's keypoints have angles of their own")
-        return self
 
     @property
     def north_up_only(self) -> bool:
@@ -156,10 +150,10 @@ class Learned(Described):
         return loaders[name](path, precision=self.precision, device=device)
 
     def detected(self, view: ViewPixels, view_idx: int) -> Raw:
-        """One feature for each point, not yet turned; with `gradient` one for each of its orientations."""
+        """One feature for each point, not yet turned; of SIFT's with `gradient` one for each of its orientations."""
         if self.detector == "sift":
             raw = detect(sift_detector(), view, view_idx)
-            return raw if self.orientation == "gradient" else raw.upright()
+            return raw if self._angles_of_sift else raw.upright()
         most = _CHOICE * self.keypoints
         points, sizes, confidences = heat_keypoints(view.gray, most, view.valid, self._network("detector"))
         return Raw.of_points(points, sizes, confidences, view_idx)
@@ -173,19 +167,30 @@ class Learned(Described):
         return balanced(raw) if self.detector == "sift" else raw.responses
 
     def turned(self, raw: Raw, views: Sequence[ViewPixels]) -> Raw:
-        """Orientations by the network, where a view needs them."""
-        if self.orientation == "gradient":
+        """Orientations by the network or by gradients, where a view needs them."""
+        if self._angles_of_sift:
             return raw
-        from aeromatch_cli.nets.orientation import directions
-
         angles = raw.orientations_deg.copy()
         for view_idx, view in enumerate(views):
             of_view = np.flatnonzero(raw.view_idx == view_idx)
             upright = self.orientation == "upright" or (self.orientation == "auto" and view.view.north_up)
             if len(of_view) and not upright:
-                cosine, sine = directions(_patches(view, raw.take(of_view)), self._network("orientation")).T
-                angles[of_view] = np.rad2deg(np.arctan2(sine, cosine))
+                angles[of_view] = self._angles(_patches(view, raw.take(of_view)))
         return replace(raw, orientations_deg=angles)
+
+    @property
+    def _angles_of_sift(self) -> bool:
+        """Whether keypoints come with orientations."""
+        return self.detector == "sift" and self.orientation == "gradient"
+
+    def _angles(self, patches: NDArray[np.uint8]) -> FloatArray:
+        """Degrees (N,), x towards y, of the direction that patches (N, 32, 32) are to be cut along."""
+        if self.orientation == "gradient":
+            return gradient_angles(patches)
+        from aeromatch_cli.nets.orientation import directions
+
+        cosine, sine = directions(patches, self._network("orientation")).T
+        return np.asarray(np.rad2deg(np.arctan2(sine, cosine)))
 
     def described(self, raw: Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
         """Descriptor bytes (N, 128), see `as_bytes`."""
