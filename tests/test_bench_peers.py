@@ -62,6 +62,7 @@ def test_every_method_is_judged_on_the_same_pairs(done: Path) -> None:
     assert len(set(pairs["opencv-sift"])) == PAIRS
     for row in rows:
         assert 0 <= row["correct"] <= row["kept"] <= KEYPOINTS
+        assert 0 <= row["on_line"] <= row["kept"]
         assert row["correct"] <= row["possible"] <= KEYPOINTS
         assert row["seconds"] > 0.01
 

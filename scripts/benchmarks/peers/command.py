@@ -10,15 +10,16 @@ are of each class, the blocks in turn. Pairs under two exposures are a class of 
 that a network that ships has seen in training, which do not count in the lines of all.
 
 Correct: matches a pair within 3 px, after thinning them one-to-one to 2 px. Right: of the kept ones. Recall: of the
-keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. At height: of the
-correct ones, how many lie at a height of the nearest reference points as well (2 px, from both images): a wrong match
-may lie on the right epipolar line. First / it: correct matches of the first of --methods over those of this one, on the
-same pairs. Error: median of the pairs' medians. Seconds: median of pairs, features of both images included, decoding
-too, and those of matching and verification alone; start-up is not timed. A preset with further steps (`auto`), which
-decides by the whole block, is run on that once, as the command does it with the same poses: its learned features have
-half the descriptors beside those of SIFT, and its seconds are the run's, divided by all pairs. `:total` gives a peer as
-many as both together. In brackets: 90 % intervals by bootstrap over pairs. OUT keeps what every method answered: what
-depends on nothing that changed is not made again.
+keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. On line: of the
+kept ones of rendered pairs, which are within 3 px of their epipolar lines: wrong ones as well, and real blocks are
+judged by these lines. At height: of the correct ones of real pairs, which lie at a height of the nearest reference
+points as well (2 px, from both images). First / it: correct matches of the first of --methods over those of this one,
+on the same pairs. Error: median of the pairs' medians. Seconds: median of pairs, features of both images included,
+decoding too, and those of matching and verification alone; start-up is not timed. A preset with further steps (`auto`),
+which decides by the whole block, is run on that once, as the command does it with the same poses: its learned features
+have half the descriptors beside those of SIFT, and its seconds are the run's, divided by all pairs. `:total` gives a
+peer as many as both together. In brackets: 90 % intervals by bootstrap over pairs. OUT keeps what every method
+answered: what depends on nothing that changed is not made again.
 """
 
 from __future__ import annotations
@@ -33,9 +34,12 @@ import numpy as np
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
+from aeromatch_cli.evaluate.scores import CORRECT_PX, VIEW_ANGLE_CLASSES
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.fingerprints import fingerprint
+from aeromatch_cli.geometry.cameras import undistort
+from aeromatch_cli.geometry.epipolar import fundamental_from_poses, symmetric_distance_px
+from aeromatch_cli.lab.rendered import RenderedTruth
 from benchmarks import options, stamps
 from benchmarks.peers.base import Options
 from benchmarks.peers.table import (
@@ -128,7 +132,20 @@ def _of_pairs(spec: str, judged: Judged, limits: Options, store: Path) -> Iterat
         score = judged.truth.judge(*pair.images, *answer)
         seconds = {"seconds": measured.seconds, "matching_s": measured.seconds - sum(measured.features_seconds)}
         row = {key: plain(value) for key, value in (score.row() | seconds).items() if key in (*FIGURES, *seconds)}
-        yield row | _at_height(judged, pair, found.points0_px, found.points1_px, score.correct_idx)
+        places = found.points0_px, found.points1_px
+        row |= _at_height(judged, pair, *places, score.correct_idx) | _on_line(judged, pair, *places, score.kept_idx)
+        yield row
+
+
+def _on_line(judged: Judged, pair: JudgedPair, points0_px: FloatArray, points1_px: FloatArray, kept: IntArray) -> Row:
+    """How many of the kept matches of a rendered pair lie near their epipolar lines: poses alone would call them right."""
+    truth = judged.truth
+    if not isinstance(truth, RenderedTruth):
+        return {}
+    cameras, poses = ([of[name] for name in pair.images] for of in (truth.cameras, truth.truth.poses))
+    matrix = fundamental_from_poses(cameras[0], poses[0], cameras[1], poses[1])
+    places = (undistort(camera, p[kept]) for camera, p in zip(cameras, (points0_px, points1_px), strict=True))
+    return {"on_line": int((symmetric_distance_px(matrix, *places) <= CORRECT_PX).sum())}
 
 
 def _at_height(
@@ -180,6 +197,7 @@ COLUMNS: tuple[Column[Sequence[Row]], ...] = (
     ("pairs", len),
     ("correct", _correct),
     ("right", lambda rows: _share(rows, "kept")),
+    ("on line", lambda rows: _share(rows, "kept", "on_line")),
     ("at height", lambda rows: _share(rows, "correct", "at_height")),
     ("recall", lambda rows: _share(rows, "possible")),
     (f">= {ENOUGH_CORRECT} correct", lambda rows: percent(np.mean([r["correct"] >= ENOUGH_CORRECT for r in rows]))),
@@ -198,9 +216,9 @@ def table_of(rows: Sequence[Row]) -> str:
         pairs = [(of_first[row["scene"], row["pair"]], row["correct"] or 0.0) for row in own]
         return ranged(ratio(*np.sum(pairs, axis=0)), interval(pairs, ratio_of_sums), 2)
 
-    # Heights are known where recall is not, and the other way round.
-    unknown = "recall" if "at_height" in rows[0] else "at height"
-    columns = [column for column in COLUMNS if column[0] != unknown]
+    # Heights of real blocks, the rest of rendered ones.
+    unknown = ("recall", "on line") if "at_height" in rows[0] else ("at height",)
+    columns = [column for column in COLUMNS if column[0] not in unknown]
     columns.insert(2, (f"`{first}` / it", beside_first))
     groups = []
     classes = dict.fromkeys((*(name for name, _ in VIEW_ANGLE_CLASSES), *REAL_CLASSES, "all"))
