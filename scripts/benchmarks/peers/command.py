@@ -138,7 +138,7 @@ def _of_pairs(spec: str, judged: Judged, limits: Options, store: Path) -> Iterat
 
 
 def _on_line(judged: Judged, pair: JudgedPair, points0_px: FloatArray, points1_px: FloatArray, kept: IntArray) -> Row:
-    """How many of the kept matches of a rendered pair lie near their epipolar lines: poses alone would call them right."""
+    """How many of a rendered pair's kept matches lie near their epipolar lines: poses alone would call them right."""
     truth = judged.truth
     if not isinstance(truth, RenderedTruth):
         return {}
