@@ -38,7 +38,7 @@ STANDING: Mapping[str, Standing] = {
     "claims": Standing("claims.md", 12, ("claims --seed 1 --data DATA --reference-weights WEIGHTS",)),
     "peers": Standing(
         "peers.md",
-        19,
+        21,
         (
             "peers rendered --reference-weights WEIGHTS",
             "peers real --data DATA --reference-weights WEIGHTS",

@@ -251,7 +251,7 @@ def main(arguments: Sequence[str]) -> None:
     else:
         add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
         add("--blocks", type=options.names, default=BLOCKS, help="names, comma-separated")
-        add("--pairs", type=options.positive, default=30, help="of each class of pairs, over all blocks")
+        add("--pairs", type=options.positive, default=10, help="of each class of pairs, over all blocks")
         add("--max-size", type=options.positive, default=800, help="longer side of images, px")
         add("--seed", type=int, default=0, help="another seed gives other pairs")
         quick |= {"blocks": "lewis", "pairs": 2, "max_size": 500}
