@@ -201,6 +201,25 @@ def test_lines_hold_sums_and_the_first_method_beside() -> None:
     assert lines[4].startswith("| all | `oblique` | 2 |")
 
 
+def test_lines_of_real_pairs_go_by_class_and_training_does_not_count_in_all() -> None:
+    def row(kind: str, pair: str, correct: int, at_height: int) -> Row:
+        figures = {"correct": correct, "kept": 100, "possible": None, "median_error_px": 0.4, "seconds": 2.0}
+        return {
+            "method": "oblique", "scene": "ochota", "pair": pair, "class": kind, **figures, "matching_s": None,
+            "at_height": at_height,
+        }  # fmt: skip
+
+    rows = [row("blocks of the training", "a d", 100, 100), row("two exposures", "a c", 50, 20)]
+    rows += [row(">60", "a b", 60, 30), row("0-25", "a e", 90, 90)]
+    lines = command.table_of(rows).splitlines()
+    assert "recall" not in lines[0]
+    assert [line.split(" | ")[0] for line in lines[2:]] == [
+        "| 0-25", "| >60", "| two exposures", "| blocks of the training", "| all"
+    ]  # fmt: skip
+    assert "| 3 | 67 (53 to 80) | 1.00 (1.00 to 1.00) | 66.7 % (53.3 to 80.0) | 70.0 % (43.8 to 87.5) |" in lines[-1]
+    assert lines[-1].endswith("| 0.40 | 2.00 | - |")
+
+
 def test_asift_of_opencv_does_well_on_an_easy_pair(done: Path) -> None:
     """Alone: its 43 views of an image take seconds."""
     block = next((done / "scenes").glob("grass-*"))

@@ -216,13 +216,14 @@ def table_of(rows: Sequence[Row]) -> str:
         pairs = [(of_first[row["scene"], row["pair"]], row["correct"] or 0.0) for row in own]
         return ranged(ratio(*np.sum(pairs, axis=0)), interval(pairs, ratio_of_sums), 2)
 
-    # Heights of real blocks, the rest of rendered ones.
-    unknown = ("recall", "on line") if "at_height" in rows[0] else ("at height",)
+    known = set().union(*rows)
+    unknown = {title for title, key in (("on line", "on_line"), ("at height", "at_height")) if key not in known}
+    unknown |= {"recall"} if "at_height" in known else set()
     columns = [column for column in COLUMNS if column[0] not in unknown]
     columns.insert(2, (f"`{first}` / it", beside_first))
     groups = []
-    classes = dict.fromkeys((*(name for name, _ in VIEW_ANGLE_CLASSES), *REAL_CLASSES, "all"))
-    for name in classes:
+    angles = tuple(name for name, _ in VIEW_ANGLE_CLASSES)
+    for name in (*(angles if all(row["class"] in angles for row in rows) else REAL_CLASSES), "all"):
         members = [row for row in rows if name == row["class"] or (name == "all" and row["class"] != TRAINING)]
         groups += [((name, code(method)), own) for (method,), own in grouped(members, "method")]
     return table(("view angle", "method"), groups, columns)
