@@ -323,7 +323,10 @@ def test_matches_of_a_run_are_those_of_its_verified_pairs(done_site: Site) -> No
     assert len(found) == len(verified) > 0
     for pair, entry in verified.items():
         points0, points1, scores = found[block.names[pair.image_id0], block.names[pair.image_id1]]
-        assert len(points0) == len(points1) == len(scores) == len(entry.matches.scores)
+        for points, image_id, side in ((points0, pair.image_id0, 0), (points1, pair.image_id1, 1)):
+            there = block.keypoints_px(image_id)[entry.matches.indices[:, side]]
+            np.testing.assert_array_equal(points, there)
+        np.testing.assert_array_equal(scores, entry.matches.scores)
 
 
 def test_nearest_neighbours_of_the_peers_are_exact() -> None:
@@ -408,7 +411,8 @@ def test_a_preset_with_further_steps_is_run_on_the_whole_block_once(
         return {pair.images: figures for pair in judged.pairs} | {("x", "y"): figures}, 30.0
 
     monkeypatch.setattr(command, "judged_run", run)
-    monkeypatch.setattr(command, "matches_of_run", lambda _: {})
+    places = np.zeros((8, 2)), np.zeros((8, 2)), np.zeros(8)
+    monkeypatch.setattr(command, "matches_of_run", lambda _: {pair.images: places for pair in judged.pairs})
     for _ in range(2):
         rows = list(command._of_run("auto", judged, base.Options(150, "image", 1, 0, None), tmp_path))
         assert rows == [{**figures, "seconds": 30.0 / (len(judged.pairs) + 1), "matching_s": None}] * len(judged.pairs)

@@ -69,9 +69,10 @@ RESULTS: Sequence[Result] = (
     ),
     Result(
         "Pairs of all view angles with exact poses, 2048 descriptors an image, beside the published chain that finds "
-        "most on this project's ground views: rendered under two suns, and of two real blocks that no network has seen",
+        "most on this project's ground views: rendered under two suns, and of two real blocks that no network was "
+        "trained on",
         "rendered: `oblique` has {disk} x the correct matches of DISK with LightGlue, {right} right, its {theirs}; "
-        "real: {aliked} x those of ALIKED with LightGlue, {real} right, its {its}",
+        "real: {aliked} x those of ALIKED with LightGlue, {real} on their epipolar lines, its {its}",
         {
             "disk": _pairs("rendered", "`oblique` / it", "disk+lightglue@ground"),
             "right": _pairs("rendered", "right", "oblique"),

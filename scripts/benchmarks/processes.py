@@ -28,6 +28,13 @@ def limit_threads(threads: int) -> None:
     os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
 
 
+def keep_arrays() -> None:
+    """In processes started from this one large arrays are not given back to the system each time, as in the program's
+    own workers (`aeromatch_cli.workers`): else every method pays for page faults."""
+    for name in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"):
+        os.environ[name] = str(4_000_000_000)
+
+
 def fresh_process(workers: int = 1, start: Callable[..., None] | None = None, *given: Any) -> ProcessPoolExecutor:
     """Processes that have imported nothing yet; `start(*given)` initialises each."""
     context = multiprocessing.get_context("spawn")

@@ -132,10 +132,10 @@ def real_blocks(
     for block, truth in truths.items():
         bright = _differently_bright(places[block] / "images")
         rng = np.random.default_rng([seed, stable_hash(block) % (1 << 32)])
-        seen = overlapping(truth)
+        seen = list(overlapping(truth).items())
         ranks = dict.fromkeys(REAL_CLASSES, 0)
         for i in rng.permutation(len(seen)):
-            images, found = list(seen.items())[i]
+            images, found = seen[i]
             kind = TWO_EXPOSURES if images in bright else class_of(found.view_angle_deg, REAL_ANGLES)
             kind = TRAINING if block in known else kind
             members[kind].append((ranks[kind], block, JudgedPair(images, kind, found)))
@@ -151,7 +151,8 @@ def _reduced(folder: Path, data: Path, block: str, max_size_px: int) -> Path:
     if not (source / "reference" / "poses.csv").is_file():
         raise ConfigError(f"{source} is no block with reference poses: give --data and --blocks of such a folder")
     out = folder / f"{block}-{max_size_px}"
-    if not (out / "block.json").is_file():
+    points = Path("reference", "points.npz")
+    if not (out / "block.json").is_file() or (source / points).is_file() > (out / points.name).is_file():
         _reduce(source, out, max_size_px)
     return out
 

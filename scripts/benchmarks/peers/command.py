@@ -6,20 +6,22 @@ A method is a peer or a preset, with settings in brackets as in `--set`, and a l
 --flights) that are judged by their exact geometry; real, blocks (DATA/BLOCK/images, DATA/BLOCK/reference) that are
 judged by the epipolar lines of their reference poses. All have exact poses, and pairs overlap by a fifth at least.
 Of a scene a quarter of the pairs is of each class of view angle, where it has as many; of real blocks together --pairs
-are of each class, the blocks in turn. Pairs under two exposures are a class of their own, and so are those of blocks
-that a network that ships has seen in training, which do not count in the lines of all.
+are of each class, the blocks in turn. Two exposures: pairs whose mean gray levels differ by a factor of 1.6 or more,
+whatever their view angle. Blocks of the training: pairs of blocks on which a network that ships was trained; the lines
+of all leave these out.
 
 Correct: matches a pair within 3 px, after thinning them one-to-one to 2 px. Right: of the kept ones. Recall: of the
 keypoints of image 0 that have one of image 1 within 3 px of their true place; unknown of real blocks. On line: of the
 kept ones of rendered pairs, which are within 3 px of their epipolar lines: wrong ones as well, and real blocks are
-judged by these lines. At height: of the correct ones of real pairs, which lie at a height of the nearest reference
-points as well (2 px, from both images). First / it: correct matches of the first of --methods over those of this one,
-on the same pairs. Error: median of the pairs' medians. Seconds: median of pairs, features of both images included,
-decoding too, and those of matching and verification alone; start-up is not timed. A preset with further steps (`auto`),
-which decides by the whole block, is run on that once, as the command does it with the same poses: its learned features
-have half the descriptors beside those of SIFT, and its seconds are the run's, divided by all pairs. `:total` gives a
-peer as many as both together. In brackets: 90 % intervals by bootstrap over pairs. OUT keeps what every method
-answered: what depends on nothing that changed is not made again.
+judged by these lines. At height: of the correct ones of real pairs, those whose depth lies between the depths of the
+six nearest points of the reference (2 px, seen from either image). First / it: correct matches of the first of
+--methods over those of this one, on the same pairs. Error: median of the pairs' medians. Seconds: median of pairs,
+features of both images included, decoding too, and those of matching and verification alone; start-up is not timed. A
+preset with further steps (`auto`), which decides by the whole block, is run on that once, as the command does it with
+the same poses: its learned features have half the descriptors beside those of SIFT, and its seconds are the run's,
+divided by all pairs, which share features. `:total` gives a peer as many as both together. Every preset has --keypoints
+descriptors, whatever its brackets say of extract.keypoints. In brackets: 90 % intervals by bootstrap over pairs. OUT
+keeps what every method answered: what depends on nothing that changed is not made again.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ from benchmarks.peers.table import (
     settings_of,
 )
 from benchmarks.peers.worker import measure
-from benchmarks.processes import limit_threads
+from benchmarks.processes import keep_arrays, limit_threads
 from benchmarks.scenes import REAL_CLASSES, TRAINING, Judged, JudgedPair, real_blocks, rendered_scenes
 from benchmarks.sources import OUR_CODE, code_digest
 from benchmarks.tables import (
@@ -78,8 +80,9 @@ from benchmarks.whole import FIGURES, judged_run, matches_of_run
 THREADS = 2
 ENOUGH_CORRECT = 30
 _NOTHING: FloatArray = np.zeros((0, 2))
+_HEIGHTS = "benchmarks/peers/heights.py"
 BLOCKS = "ochota,lewis,seneca,sheffield,caliterra,brighton"
-# Of real pairs the table has the strongest opponents alone: the others are far behind on rendered ones.
+# Of real pairs the table has the strongest opponents alone, for the sake of time.
 REAL_METHODS = (
     "oblique,oblique+nearest=oblique[match=bidirectional,match.ratio=0.9,match.guided=true],"
     "oblique of ALIKED=oblique[extract=aliked,match=lightglue-aliked],auto,pycolmap-guided,aliked+lightglue,"
@@ -94,7 +97,7 @@ METHODS = (
 
 
 def asked_scenes(args: argparse.Namespace) -> Iterator[Judged]:
-    """One after the other, each made when it is needed."""
+    """One after the other, rendered ones each made when it is needed."""
     if "scenes" in args:
         yield from (judged for _, judged in rendered_scenes(args, "angles"))
     else:
@@ -162,7 +165,7 @@ def _of_run(spec: str, judged: Judged, limits: Options, store: Path) -> Iterator
     """Figures of a preset that decides by the whole block, from one run of the command; its seconds are shared by all
     pairs of the run."""
     asked = [spec, load(*parse_method(spec)).model_dump(mode="json"), judged.key, limits.keypoints]
-    path = store / f"{fingerprint(asked, code_digest(*OUR_CODE))[:16]}.json"
+    path = store / f"{fingerprint(asked, code_digest(*OUR_CODE, _HEIGHTS))[:16]}.json"
     if not path.is_file():
         scene = judged.scene
         rows, seconds = judged_run(
@@ -171,10 +174,12 @@ def _of_run(spec: str, judged: Judged, limits: Options, store: Path) -> Iterator
         matched = matches_of_run(store / "work")
         found = []
         for pair in judged.pairs:
-            places = matched.get(pair.images, (_NOTHING, _NOTHING, np.zeros(0)))
+            row = rows[pair.images]
+            # A pair whose matches are kept must be found under the same names.
+            places = matched[pair.images] if row["kept"] else (_NOTHING, _NOTHING, np.zeros(0))
             correct = judged.truth.judge(*pair.images, _NOTHING, _NOTHING, *places).correct_idx
             shared = {"seconds": seconds / len(rows), "matching_s": None}
-            found.append({**rows[pair.images], **shared, **_at_height(judged, pair, *places[:2], correct)})
+            found.append({**row, **shared, **_at_height(judged, pair, *places[:2], correct)})
         write_json(path, {"rows": found})
     yield from read_json(path)["rows"]
 
@@ -261,6 +266,7 @@ def main(arguments: Sequence[str]) -> None:
     options.add_output(parser)
     args = options.parse(parser, rest, quick)
     limit_threads(THREADS)
+    keep_arrays()
     methods = named_methods(args.methods)
     for name in methods:
         check_method(name.spec)

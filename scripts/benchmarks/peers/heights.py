@@ -29,7 +29,8 @@ _AROUND, _LEAST = 6, 60
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """Reference points (P, 3) in the frame of the poses, and the images that see them, by name."""
+    """Cameras and poses of images by name, and reference points (P, 3) in the frame of the poses. Points that something
+    hides from an image count as seen by it: they widen the range of depths."""
 
     cameras: Mapping[str, Camera]
     poses: Mapping[str, Pose]
