@@ -14,6 +14,8 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
+from aeromatch_cli.workers import KEPT_ARRAYS
+
 T = TypeVar("T")
 _EVERY_S = 0.2
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -30,9 +32,8 @@ def limit_threads(threads: int) -> None:
 
 def keep_arrays() -> None:
     """In processes started from this one large arrays are not given back to the system each time, as in the program's
-    own workers (`aeromatch_cli.workers`): else every method pays for page faults."""
-    for name in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"):
-        os.environ[name] = str(4_000_000_000)
+    own workers: else every method pays for page faults."""
+    os.environ.update(KEPT_ARRAYS)
 
 
 def fresh_process(workers: int = 1, start: Callable[..., None] | None = None, *given: Any) -> ProcessPoolExecutor:

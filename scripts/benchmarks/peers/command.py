@@ -36,11 +36,10 @@ import numpy as np
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.evaluate.reference import ReferenceTruth
 from aeromatch_cli.evaluate.scores import CORRECT_PX, VIEW_ANGLE_CLASSES
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.fingerprints import fingerprint
-from aeromatch_cli.geometry.cameras import undistort
-from aeromatch_cli.geometry.epipolar import fundamental_from_poses, symmetric_distance_px
 from aeromatch_cli.lab.rendered import RenderedTruth
 from benchmarks import options, stamps
 from benchmarks.peers.base import Options
@@ -145,10 +144,10 @@ def _on_line(judged: Judged, pair: JudgedPair, points0_px: FloatArray, points1_p
     truth = judged.truth
     if not isinstance(truth, RenderedTruth):
         return {}
-    cameras, poses = ([of[name] for name in pair.images] for of in (truth.cameras, truth.truth.poses))
-    matrix = fundamental_from_poses(cameras[0], poses[0], cameras[1], poses[1])
-    places = (undistort(camera, p[kept]) for camera, p in zip(cameras, (points0_px, points1_px), strict=True))
-    return {"on_line": int((symmetric_distance_px(matrix, *places) <= CORRECT_PX).sum())}
+    # A reference asks the height of the ground for overlaps alone.
+    by_poses = ReferenceTruth(truth.cameras, truth.truth.poses, ground_z_m=0.0)
+    errors_px = by_poses.errors(*pair.images, points0_px[kept], points1_px[kept])
+    return {"on_line": int((errors_px <= CORRECT_PX).sum())}
 
 
 def _at_height(
