@@ -34,7 +34,9 @@ class Standing:
 
 
 STANDING: Mapping[str, Standing] = {
-    "auto": Standing("auto.md", 52, ("auto rendered", "auto strategies", "auto real --data DATA")),
+    "auto": Standing(
+        "auto.md", 52, ("auto rendered", "auto strategies", "auto real --data DATA --reference-weights WEIGHTS")
+    ),
     "claims": Standing("claims.md", 12, ("claims --seed 1 --data DATA --reference-weights WEIGHTS",)),
     "peers": Standing(
         "peers.md",

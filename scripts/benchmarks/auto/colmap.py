@@ -16,11 +16,11 @@ def matched_by_colmap(images: Path, database: Path, *, keypoints: int, max_size_
     """Seconds of COLMAP's SIFT, one camera by EXIF, and exhaustive guided matching. Its limit of keypoints keeps whole
     scale levels, up to 45 % more than asked for."""
     database.unlink(missing_ok=True)
-    seconds = _in_process(_extract, images, database, keypoints, max_size_px, jobs)
-    return seconds + _in_process(_match, database, keypoints, jobs)
+    seconds = in_process(_extract, images, database, keypoints, max_size_px, jobs)
+    return seconds + in_process(_match, database, keypoints, jobs)
 
 
-def _in_process(step: Callable[..., float], *given: Any) -> float:
+def in_process(step: Callable[..., float], *given: Any) -> float:
     """SystemExit where the process dies."""
     with fresh_process() as process:
         try:

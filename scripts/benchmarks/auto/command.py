@@ -11,7 +11,9 @@
   real        every k-th image of real blocks (DATA/BLOCK/images, DATA/BLOCK/reference/{poses.csv,block.json}), with
               positions that are off by 5 m or nothing, cameras from EXIF: images in the largest group of the exported
               block, beside what both of pycolmap's mappers (incremental / global) register from the same run's export
-              and from pycolmap's own chain: its SIFT of the same size and number, exhaustive guided matching. Correct
+              and from two other chains. One is pycolmap's: its SIFT of the same size and number, exhaustive guided
+              matching. The other is ALIKED with LightGlue on all pairs of the same images, verified by pycolmap, with
+              as many descriptors as both steps of `auto` together (where its weights are found). Correct
               attitudes: within 3 degrees of the reference after one common turn. They, points and error are of the
               images of the largest group here, of the largest model of the mapper that registers more there;
               its seconds are those of the whole chain
@@ -99,6 +101,7 @@ def _real(arguments: Sequence[str]) -> None:
     add("--keypoints", type=options.positive, default=4000, help="SIFT descriptors per image")
     add("--max-size", type=options.positive, default=1600, help="longer side of images, px")
     add("--jobs", type=options.positive, default=2, help="processes at a time")
+    add("--reference-weights", type=Path, metavar="DIR", help="weights of ALIKED and its LightGlue; else without them")
     options.add_output(parser)
     quick = {"blocks": "seneca", "thin": "5", "presets": "baseline", "keypoints": 1000, "max_size": 800}
     args = options.parse(parser, arguments, quick)

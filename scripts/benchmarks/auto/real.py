@@ -1,10 +1,12 @@
-"""Thinned real blocks: images in the block's own model beside those that pycolmap's mappers register."""
+"""Thinned real blocks: images in the block's own model beside those that pycolmap's mappers register, from its own SIFT
+and from the strongest published chain."""
 
 from __future__ import annotations
 
 import argparse
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,15 +22,18 @@ from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.workspace import Workspace
 from benchmarks.auto.colmap import matched_by_colmap
+from benchmarks.auto.lightglue import CHAIN, matched_by_lightglue
 from benchmarks.orientation.cases import worsened
 from benchmarks.orientation.figures import attitudes_of, most_alike
+from benchmarks.peers.table import missing_weights
 from benchmarks.sources import OUR_CODE, PEER_CODE, code_digest
 from benchmarks.tables import Row, interval, markdown, number, plain, ranged, ratio, ratio_of_sums
 from benchmarks.whole import budget_settings, chosen_images, whole_run
 
 # What is given -> case of the benchmark of orientation.
 GIVEN = {"positions": "noise", "nothing": "nothing"}
-_OWN_CODE = "benchmarks/auto/real.py"
+_OWN_CODE = ("benchmarks/auto/real.py", "benchmarks/auto/lightglue.py", "benchmarks/auto/colmap.py")
+COLMAP = "pycolmap"
 MAPPERS: tuple[Mapper, ...] = ("incremental", "global")
 # Of attitudes after one common turn.
 CORRECT_DEG = 3.0
@@ -36,6 +41,7 @@ HEADS = (
     "block", "given", "preset", "images", "in our model", "attitudes correct", "from our export",
     "by pycolmap alone", "attitudes correct",
     "points", "its points", "error px", "its error px", "s", "its s",
+    f"by {CHAIN}", "attitudes correct", "its points", "its error px", "its s",
 )  # fmt: skip
 
 
@@ -46,7 +52,10 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
         images = chosen_images(args.data / block / "images", every, args.out / "images" / f"{block}-{every}")
         folder = args.out / "real" / f"{block}-{every}"
         folder.mkdir(parents=True, exist_ok=True)
-        peer = _kept(args, folder / "pycolmap.json", PEER_CODE, lambda: _by_pycolmap(args, images, reference, folder))  # noqa: B023
+        peers = {}
+        for name in asked_peers(args.reference_weights):
+            make = partial(_by_peer, args, name, images, reference, folder)
+            peers[name] = _kept(args, folder / f"{name}.json", PEER_CODE, make)
         for given, preset in product(args.given, args.presets):
             own = _kept(
                 args, folder / f"{preset}-{given}.json", OUR_CODE,
@@ -54,12 +63,12 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
             )  # fmt: skip
             count = len(list(images.iterdir()))
             head = {"block": block, "every": every, "given": given, "preset": preset, "images": count}
-            yield {**head, **own, "pycolmap": peer}
+            yield {**head, **own, **peers}
 
 
 def _kept(args: argparse.Namespace, path: Path, code: Sequence[str], make: Any) -> Row:
     """What a file has of the same options and code, else what `make` returns."""
-    asked = {"keypoints": args.keypoints, "max_size": args.max_size, "code": code_digest(*code, _OWN_CODE)}
+    asked = {"keypoints": args.keypoints, "max_size": args.max_size, "code": code_digest(*code, *_OWN_CODE)}
     known = read_json(path) if path.is_file() else {}
     if known.get("asked") != asked:
         known = {"asked": asked, "row": make()}
@@ -112,10 +121,20 @@ def largest_group(workspace: Workspace) -> tuple[list[str], Row]:
     }
 
 
-def _by_pycolmap(args: argparse.Namespace, images: Path, reference: Path, folder: Path) -> Row:
-    """Both mappers on pycolmap's own matches."""
+def asked_peers(weights: Path | None) -> list[str]:
+    """Chains beside which presets stand: the published one where its weights are there."""
+    return [COLMAP] if missing_weights(CHAIN, weights) else [COLMAP, CHAIN]
+
+
+def _by_peer(args: argparse.Namespace, name: str, images: Path, reference: Path, folder: Path) -> Row:
+    """Both mappers on a peer's own matches; the published chain has as many descriptors as both steps of `auto`."""
     database = folder / "database.db"
-    seconds = matched_by_colmap(images, database, keypoints=args.keypoints, max_size_px=args.max_size, jobs=args.jobs)
+    most = {"max_size_px": args.max_size, "jobs": args.jobs}
+    if name == COLMAP:
+        seconds = matched_by_colmap(images, database, keypoints=args.keypoints, **most)
+    else:
+        total, weights = args.keypoints + args.keypoints // 2, args.reference_weights
+        seconds = matched_by_lightglue(images, database, keypoints=total, weights=weights, **most)
     row: Row = {}
     for mapper in MAPPERS:
         found = map_database(database, images, mapper, attitudes=True)
@@ -131,7 +150,7 @@ def _correct(found: Mapping[str, Any], reference: Path) -> int:
 
 
 def best_mapper(peer: Row) -> Row:
-    """Of pycolmap's own chain the mapper that registers most images."""
+    """Of a peer's chain the mapper that registers most images."""
     found: Row = max((peer[mapper] for mapper in MAPPERS), key=lambda row: (row.get("registered", 0), row["correct"]))
     return found
 
@@ -139,34 +158,68 @@ def best_mapper(peer: Row) -> Row:
 def table_of(rows: Sequence[Row]) -> str:
     """A line for every case, and the sums."""
     lines: list[list[object]] = []
-    points: dict[str, list[tuple[float, float]]] = {}
-    alike: dict[str, list[tuple[float, float]]] = {}
-    images: dict[str, list[tuple[float, float]]] = {}
+    most: dict[str, list[tuple[float, float]]] = {}
     for row in rows:
-        peer = row["pycolmap"]
-        best = best_mapper(peer)
+        peer, best = row[COLMAP], best_mapper(row[COLMAP])
         export = " / ".join(str(row.get(f"by_{mapper}", 0)) for mapper in MAPPERS)
-        alone = " / ".join(str(peer[mapper].get("registered", 0)) for mapper in MAPPERS)
-        block = row["block"] if row["every"] == 1 else f"{row['block']} / {row['every']}"
         errors = [number(one.get("reprojection_error_px") or np.nan, 2) for one in (row, best)]
         lines.append(
-            [block, row["given"], f"`{row['preset']}`", row["images"], row["registered"], row["correct"], export, alone,
-             best["correct"], row.get("points") or 0, best.get("points", 0), *errors, number(row["seconds"]),
-             number(best["seconds"])]
+            [_thinned(row), row["given"], f"`{row['preset']}`", row["images"], row["registered"], row["correct"],
+             export, _registered(peer), best["correct"], row.get("points") or 0, best.get("points", 0), *errors,
+             number(row["seconds"]), number(best["seconds"]), *_published(row)]
         )  # fmt: skip
-        most = max([best.get("registered", 0)] + [row.get(f"by_{m}", 0) for m in MAPPERS])
-        points.setdefault(block, []).append((row.get("points") or 0, best.get("points", 0)))
-        if best.get("registered", 0) == row["registered"]:
-            alike.setdefault(block, []).append(points[block][-1])
-        images.setdefault(block, []).append((row["registered"], most))
-    fewer = sum(own < most for cases in images.values() for own, most in cases)
+        others = [best.get("registered", 0)] + [row.get(f"by_{m}", 0) for m in MAPPERS]
+        most.setdefault(_thinned(row), []).append((row["registered"], max(others)))
+    fewer = sum(own < other for cases in most.values() for own, other in cases)
     parts = [
-        f"Points over pycolmap's, all cases: {_beside(points)}; where it registers as many images by itself: "
-        f"{_beside(alike)}. Images in our model over the most that any mapper "
-        f"registers from either: {_beside(images)}; fewer in {fewer} of {len(rows)} cases.",
+        f"{_points_beside(rows, COLMAP)}. Images in our model over the most that any mapper registers from our export "
+        f"or pycolmap's chain: {_beside(most)}; fewer in {fewer} of {len(rows)} cases.",
+        *([_beside_published(rows)] if any(CHAIN in row for row in rows) else []),
         markdown(HEADS, lines),
     ]
     return "\n\n".join(parts)
+
+
+def _thinned(row: Row) -> str:
+    return str(row["block"]) if row["every"] == 1 else f"{row['block']} / {row['every']}"
+
+
+def _registered(peer: Row) -> str:
+    return " / ".join(str(peer[mapper].get("registered", 0)) for mapper in MAPPERS)
+
+
+def _published(row: Row) -> list[object]:
+    """Columns of the published chain, empty where it was not run."""
+    if CHAIN not in row:
+        return [""] * 5
+    best = best_mapper(row[CHAIN])
+    error = number(best.get("reprojection_error_px") or np.nan, 2)
+    return [_registered(row[CHAIN]), best["correct"], best.get("points", 0), error, number(best["seconds"])]
+
+
+def _points_beside(rows: Sequence[Row], peer: str) -> str:
+    points: dict[str, list[tuple[float, float]]] = {}
+    alike: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        best = best_mapper(row[peer])
+        both = (row.get("points") or 0, best.get("points", 0))
+        points.setdefault(_thinned(row), []).append(both)
+        if best.get("registered", 0) == row["registered"]:
+            alike.setdefault(_thinned(row), []).append(both)
+    return (
+        f"Points over those of {peer}, all cases: {_beside(points)}; where it registers as many images by itself: "
+        f"{_beside(alike)}"
+    )
+
+
+def _beside_published(rows: Sequence[Row]) -> str:
+    cases = [(row, best_mapper(row[CHAIN])) for row in rows if CHAIN in row]
+    images = sum(row["registered"] < best.get("registered", 0) for row, best in cases)
+    points = sum((row.get("points") or 0) < best.get("points", 0) for row, best in cases)
+    return (
+        f"{_points_beside([row for row, _ in cases], CHAIN)}. Fewer images than it in {images}, fewer points in "
+        f"{points} of {len(cases)} cases."
+    )
 
 
 def _beside(cases: Mapping[str, Sequence[tuple[float, float]]]) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.loading import check_same_tensors
 from benchmarks.peers.base import (
@@ -124,19 +125,21 @@ class WithLightGlue:
     def features(self, image: str) -> Described:
         return self.peer.features(image)  # type: ignore[no-any-return]
 
-    def candidates(self, image0: str, image1: str, features0: Described, features1: Described) -> Candidates:
+    def rows(self, features0: Described, features1: Described) -> tuple[IntArray, FloatArray]:
+        """Matches (M, 2) as rows of the two images' features, and their scores (M,)."""
         import torch
 
-        del image0, image1
         sides = [_side(features) for features in (features0, features1)]
         if min(len(features0.places_px), len(features1.places_px)) < 2:
-            nothing = np.zeros((0, 2))
-            return nothing, nothing, np.zeros(0)
+            return np.zeros((0, 2), np.int64), np.zeros(0)
         with torch.inference_mode():
             answer = self.network({"image0": sides[0], "image1": sides[1]})
-        rows, columns = answer["matches"][0].numpy().T
-        scores = answer["scores"][0].numpy().astype(np.float64)
-        return features0.places_px[rows], features1.places_px[columns], scores
+        return answer["matches"][0].numpy(), answer["scores"][0].numpy().astype(np.float64)
+
+    def candidates(self, image0: str, image1: str, features0: Described, features1: Described) -> Candidates:
+        del image0, image1
+        matches, scores = self.rows(features0, features1)
+        return features0.places_px[matches[:, 0]], features1.places_px[matches[:, 1]], scores
 
     def match(self, image0: str, image1: str, features0: Described, features1: Described) -> Found:
         points0, points1, scores = self.candidates(image0, image1, features0, features1)
