@@ -263,9 +263,16 @@ def pixels_of_rays(camera: Camera, rays: FloatArray) -> FloatArray:
 
 def project(camera: Camera, world_rotation: FloatArray, center_m: FloatArray, points_m: FloatArray) -> FloatArray:
     """Stored pixels (N, 2) of world points (N, 3); NaN behind the camera or outside the lens model."""
+    return distort(camera, undistorted_places(camera, world_rotation, center_m, points_m)[0])
+
+
+def undistorted_places(
+    camera: Camera, world_rotation: FloatArray, center_m: FloatArray, points_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Undistorted pixels (N, 2) of world points (N, 3), NaN behind the camera, and their depths (N,) along its axis."""
     rays = (np.asarray(points_m, dtype=np.float64) - center_m) @ np.asarray(world_rotation).T
     depth = np.where(rays[:, 2] > 1e-9, rays[:, 2], np.nan)
-    return distort(camera, _pixels(parameters(camera), rays[:, :2] / depth[:, None]))
+    return _pixels(parameters(camera), rays[:, :2] / depth[:, None]), rays[:, 2]
 
 
 def world_rays(camera: Camera, world_rotation: FloatArray, points_px: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from aeromatch_cli.blocks.observations import observation_of_row
 from aeromatch_cli.blocks.poses import read_poses
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.evaluate.reference import ReferenceTruth
-from aeromatch_cli.geometry.cameras import calibration_matrix, undistort
+from aeromatch_cli.geometry.cameras import undistort, undistorted_places
 from aeromatch_cli.geometry.prediction import homogeneous
 
 TOLERANCE_PX = 2.0
@@ -78,8 +78,4 @@ class Heights:
     def _projected(self, name: str, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Undistorted places (N, 2), NaN behind the camera, and depths (N,)."""
         pose = self.poses[name]
-        offsets = (points_m - pose.center_m) @ np.asarray(pose.world_rotation).T
-        flat = offsets @ calibration_matrix(self.cameras[name]).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            places = np.where(offsets[:, 2:] > 0.0, flat[:, :2] / flat[:, 2:], np.nan)
-        return places, offsets[:, 2]
+        return undistorted_places(self.cameras[name], np.asarray(pose.world_rotation), pose.center_m, points_m)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from aeromatch_cli.data import Camera, FloatArray, Pose
 from aeromatch_cli.formats.features import read_features
-from aeromatch_cli.geometry.cameras import calibration_matrix, undistort
+from aeromatch_cli.geometry.cameras import undistort, undistorted_places
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, symmetric_distance_px
 from aeromatch_cli.geometry.prediction import homogeneous
 from aeromatch_cli.stages import extract
@@ -77,15 +77,12 @@ def pictures_of(folder: Path, recipe: tuple[str, ...]) -> list[Picture]:
 
 def _inverse_depths(camera: Camera, pose: Pose, places_px: FloatArray, points_m: FloatArray) -> FloatArray | None:
     """(N, HEIGHTS) of the reference points that are nearest in the picture; None where it shows too few."""
-    offsets = (points_m - pose.center_m) @ np.asarray(pose.world_rotation).T
-    offsets = offsets[offsets[:, 2] > 0.0]
-    there = offsets @ calibration_matrix(camera).T
-    there = there[:, :2] / there[:, 2:]
+    there, depths_m = undistorted_places(camera, np.asarray(pose.world_rotation), pose.center_m, points_m)
     inside = ((there >= 0.0) & (there <= [camera.width_px, camera.height_px])).all(axis=1)
     if inside.sum() < 10 * HEIGHTS:
         return None
     rows = cKDTree(there[inside]).query(places_px, k=HEIGHTS)[1]
-    return np.asarray(1.0 / offsets[inside][rows, 2])
+    return np.asarray(1.0 / depths_m[inside][rows])
 
 
 def truth_of(picture0: Picture, picture1: Picture) -> Partners:
@@ -109,12 +106,10 @@ def _place_in(picture: Picture, other: Picture) -> FloatArray:
     rays = homogeneous(picture.camera, picture.side.places_px.astype(np.float64))
     rays = rays @ np.asarray(picture.pose.world_rotation)
     points = picture.pose.center_m + rays[:, None] / picture.inverse_depths[..., None]
-    seen_there = (points - other.pose.center_m) @ np.asarray(other.pose.world_rotation).T
-    projected = seen_there @ calibration_matrix(other.camera).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        there = projected[..., :2] / projected[..., 2:]
+    view = other.camera, np.asarray(other.pose.world_rotation), other.pose.center_m
+    there = undistorted_places(*view, points.reshape(-1, 3))[0].reshape(*points.shape[:2], 2)
     size = np.array([other.camera.width_px, other.camera.height_px])
-    there[(projected[..., 2] <= 0.0) | ((there < 0.0) | (there > size)).any(axis=2)] = np.nan
+    there[((there < 0.0) | (there > size)).any(axis=2)] = np.nan
     known = np.isfinite(there).all(axis=2)
     distance = np.full(known.shape, np.inf)
     distance[known] = cKDTree(other.side.places_px).query(there[known])[0]
