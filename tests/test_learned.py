@@ -95,12 +95,12 @@ def test_upright_features_are_not_turned(picture: NDArray[np.uint8]) -> None:
 
 def test_angles_of_gradients_are_those_of_sift(picture: NDArray[np.uint8]) -> None:
     """A point may have several. The picture turned by 60 degrees matches itself."""
-    found = extract(picture, detector="sift")
+    found = extract(picture, detector="sift", orientation="gradient")
     assert len(found.descriptors) > len(found.keypoints_px) > 100
     assert found.view_orientation_deg.std() > 30.0
     matrix = cv2.getRotationMatrix2D(((SIDE - 1) / 2, (SIDE - 1) / 2), 60.0, 1.0)
     turned = cv2.warpAffine(picture, matrix, (SIDE, SIDE), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
-    _, share = share_right(found, extract(turned, detector="sift"), matrix)
+    _, share = share_right(found, extract(turned, detector="sift", orientation="gradient"), matrix)
     assert share > 0.9
 
 
@@ -131,10 +131,9 @@ def test_a_small_budget_buys_the_surest_and_spreads_them(picture: NDArray[np.uin
 @pytest.mark.parametrize(
     ("settings", "names"),
     [
-        ({}, ["detector", "geodesc"]),
-        ({"orientation": "network"}, ["detector", "geodesc", "orientation"]),
+        ({}, ["detector", "geodesc", "orientation"]),
         ({"detector": "sift", "orientation": "upright"}, ["geodesc"]),
-        ({"context": True}, ["context", "detector", "geodesc"]),
+        ({"context": True}, ["context", "detector", "geodesc", "orientation"]),
     ],
 )
 def test_the_weights_that_are_asked_are_part_of_the_recipe(settings: dict[str, Any], names: list[str]) -> None:
@@ -251,7 +250,7 @@ def test_own_weights_that_are_not_there_or_no_network_are_named(tmp_path: Path) 
     for place, wrong in (
         ("absent", "is no folder"),
         ("other", "is a file; give its folder"),
-        (".", r"holds none of .*: detector\.safetensors, geodesc\.safetensors$"),
+        (".", r"holds none of .*: detector\.safetensors, geodesc\.safetensors, orient"),
     ):
         with pytest.raises(ConfigError, match=wrong):
             Learned(weights=str(tmp_path / place)).check_files(128)

@@ -1,8 +1,8 @@
 """Learned keypoints, orientations and descriptors on every view of an image.
 
-A heat map network finds the keypoints, the gradients around them turn them where a view does not have north up, and
-GeoDesc describes a patch of learned place and size. On request an orientation network turns them, and a context network
-adds what is around them. Trained by scripts/train detector, orientation, descriptor and context (nets/trained/*.md).
+A heat map network finds the keypoints, an orientation network turns them where a view does not have north up, GeoDesc
+describes a patch of learned place, size and turn, and a context network adds what is around it. Trained by
+scripts/train detector, orientation, descriptor and context (nets/trained/*.md).
 
 Source: Deep learning feature matching of oblique images, J. Geo-inf. Sci. 2021(10), 1823-1837; Luo et al., GeoDesc,
 ECCV 2018; Tian et al., L2-Net, CVPR 2017; Luo et al., ContextDesc, CVPR 2019.
@@ -54,7 +54,7 @@ class Learned(Described):
     orientation: Literal["auto", "network", "gradient", "upright"] = Field(
         "auto",
         description="Rotate patches by the orientation network (network), by the main direction of their gradients "
-        "(gradient), or not at all (upright). auto: by gradients, upright in views that have north up.",
+        "(gradient), or not at all (upright). auto: by the network, upright in views that have north up.",
     )
     context: bool = Field(
         False,
@@ -122,7 +122,7 @@ class Learned(Described):
             "context": self.context,
             "detector": self.detector == "network",
             "geodesc": True,
-            "orientation": self.orientation == "network",
+            "orientation": self.orientation in ("auto", "network"),
         }
         return [name for name, asked in needed.items() if asked]
 
@@ -150,10 +150,10 @@ class Learned(Described):
         return loaders[name](path, precision=self.precision, device=device)
 
     def detected(self, view: ViewPixels, view_idx: int) -> Raw:
-        """One feature for each point, not yet turned; of SIFT's one per orientation where these are used."""
+        """One feature for each point, not yet turned; of SIFT's with `gradient` one for each of its orientations."""
         if self.detector == "sift":
             raw = detect(sift_detector(), view, view_idx)
-            return raw if self._keeps_angles_of_sift(view) else raw.upright()
+            return raw if self._angles_of_sift else raw.upright()
         most = _CHOICE * self.keypoints
         points, sizes, confidences = heat_keypoints(view.gray, most, view.valid, self._network("detector"))
         return Raw.of_points(points, sizes, confidences, view_idx)
@@ -167,24 +167,25 @@ class Learned(Described):
         return balanced(raw) if self.detector == "sift" else raw.responses
 
     def turned(self, raw: Raw, views: Sequence[ViewPixels]) -> Raw:
-        """Orientations by gradients or by the network, where a view needs them."""
+        """Orientations by the network or by gradients, where a view needs them."""
+        if self._angles_of_sift:
+            return raw
         angles = raw.orientations_deg.copy()
         for view_idx, view in enumerate(views):
             of_view = np.flatnonzero(raw.view_idx == view_idx)
-            if len(of_view) and not self._upright(view) and not self._keeps_angles_of_sift(view):
+            upright = self.orientation == "upright" or (self.orientation == "auto" and view.view.north_up)
+            if len(of_view) and not upright:
                 angles[of_view] = self._angles(_patches(view, raw.take(of_view)))
         return replace(raw, orientations_deg=angles)
 
-    def _upright(self, view: ViewPixels) -> bool:
-        return self.orientation == "upright" or (self.orientation == "auto" and view.view.north_up)
-
-    def _keeps_angles_of_sift(self, view: ViewPixels) -> bool:
+    @property
+    def _angles_of_sift(self) -> bool:
         """Whether keypoints come with orientations."""
-        return self.detector == "sift" and self.orientation != "network" and not self._upright(view)
+        return self.detector == "sift" and self.orientation == "gradient"
 
     def _angles(self, patches: NDArray[np.uint8]) -> FloatArray:
         """Degrees (N,), x towards y, of the direction that patches (N, 32, 32) are to be cut along."""
-        if self.orientation != "network":
+        if self.orientation == "gradient":
             return gradient_angles(patches)
         from aeromatch_cli.nets.orientation import directions
 

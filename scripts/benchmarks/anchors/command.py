@@ -46,8 +46,8 @@ _THREADS = 1
 _PUBLISHED = "homogr"  # the layout whose table stands in docs/results
 METHODS = (
     "oblique,oblique+nearest=oblique[match=bidirectional,match.ratio=0.9,match.guided=true],"
-    "own on SIFT=oblique[match=bidirectional,match.ratio=0.9,extract.detector=sift],"
-    "orientation network=oblique[extract.orientation=network],"
+    "own on SIFT=oblique[match=bidirectional,match.ratio=0.9,extract.detector=sift,extract.orientation=gradient],"
+    "gradients=oblique[extract.orientation=gradient],"
     "baseline,SIFT=opencv-sift,aliked,aliked+lightglue,aliked-rot+lightglue,disk+lightglue,xfeat+lighterglue"
 )
 

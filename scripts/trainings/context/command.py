@@ -1,6 +1,6 @@
 """Train the context network that ships with the package: descriptors that know what is around them.
 
-Views of rendered blocks (trainings.blocks) with the shipped detector and GeoDesc; partners by
+Views of rendered blocks (trainings.blocks) with the shipped detector, orientation network and GeoDesc; partners by
 exact truth, so that parallax, occlusion, oblique views and other suns are in it. Of a pair, every keypoint with a
 partner must be more alike to it than to any other keypoint of the other view, either way (cross entropy over cosines,
 learned temperature). Keypoints are dropped, and coarse pictures' brightness changed, at random. The learning rate falls

@@ -1,7 +1,7 @@
 """Views of rendered blocks with learned keypoints, their plain descriptors and coarse pictures, and true partners.
 
 Every block is looked at twice: in north-up ground views from noisy poses, upright, and in the stored pictures, turned
-by their gradients.
+by the orientation network.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class ContextPair:
 def block_pairs(folder: Path, path: Path, weights: Path | None = None) -> list[ContextPair]:
     """Pairs of a rendered block with partners enough, from the file `path` where it is there.
 
-    weights: folder of detector and GeoDesc; what it lacks, or None, are those that ship.
+    weights: folder of detector, orientation network and GeoDesc; what it lacks, or None, are those that ship.
     """
     if not path.is_file():
         _write(folder, path, weights)

@@ -52,7 +52,7 @@ def extractor_of(features: str, *, free: bool) -> Sift | Learned:
     """features: "sift" or "learned". free: views are turned at will."""
     if features == "sift":
         return Sift(keypoints=KEYPOINTS, orientation="gradient" if free else "upright")
-    return Learned(keypoints=KEYPOINTS, orientation="gradient" if free else "upright")
+    return Learned(keypoints=KEYPOINTS, orientation="network" if free else "upright")
 
 
 def make_group(paths: list[Path], seed: int, features: str = "sift") -> Group:
