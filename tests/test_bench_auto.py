@@ -122,16 +122,18 @@ def test_images_in_our_model_stand_beside_the_most_of_any_mapper() -> None:
 
 
 def test_places_of_reduced_images_are_those_of_the_stored_ones(tmp_path: Path) -> None:
-    """What the published chain sees of an image of 40 x 30 pixels, 20 at most: its corners stay corners."""
-    pixels = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
+    """What the published chain sees of an image of 41 x 30 pixels, 20 at most: its corners stay corners."""
+    pixels = np.random.default_rng(0).integers(0, 255, (30, 41, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "large.png"), pixels)
     cv2.imwrite(str(tmp_path / "small.png"), pixels[:12, :16])
     (tmp_path / "out").mkdir()
     names = ["large.png", "small.png"]
-    assert lightglue.reduced(tmp_path, names, tmp_path / "out", 20) == {"large.png": 2.0, "small.png": 1.0}
+    scales = lightglue.reduced(tmp_path, names, tmp_path / "out", 20)
     half, same = (cv2.imread(str(tmp_path / "out" / name)) for name in names)
     assert half.shape == (15, 20, 3)
-    np.testing.assert_allclose(half[3, 5], pixels[6:8, 10:12].reshape(4, 3).mean(axis=0), atol=1.0)
+    corners = lightglue.corner_places(np.array([[-0.5, -0.5], [19.5, 14.5]]), scales["large.png"])
+    np.testing.assert_allclose(corners, [[0.0, 0.0], [41.0, 30.0]])
+    np.testing.assert_allclose(lightglue.corner_places(np.zeros((1, 2)), scales["small.png"]), [[0.5, 0.5]])
     np.testing.assert_array_equal(same, pixels[:12, :16])
     with pytest.raises(SystemExit, match="absent"):
         lightglue.reduced(tmp_path, ["absent.png"], tmp_path / "out", 20)
@@ -163,6 +165,7 @@ def test_what_cannot_be_measured_is_refused(capsys: pytest.CaptureFixture[str]) 
         (["rendered", "--methods", "baseline"], "must hold auto"),
         (["rendered", "--places", "moon:nadir"], "moon:nadir"),
         (["real", "--data", "d", "--given", "all"], "all are none"),
+        (["real", "--data", "d", "--blocks", "moon"], "moon not found in d"),
     ):
         with pytest.raises(SystemExit) as stopped:
             command.main([*words, "--out", "nowhere"])

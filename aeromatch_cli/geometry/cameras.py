@@ -269,7 +269,10 @@ def project(camera: Camera, world_rotation: FloatArray, center_m: FloatArray, po
 def undistorted_places(
     camera: Camera, world_rotation: FloatArray, center_m: FloatArray, points_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Undistorted pixels (N, 2) of world points (N, 3), NaN behind the camera, and their depths (N,) along its axis."""
+    """Undistorted pixels (N, 2) of world points (N, 3), metres, and their depths (N,) along the axis, metres.
+
+    world_rotation: (3, 3), world to camera. Pixels are NaN where the depth is not positive.
+    """
     rays = (np.asarray(points_m, dtype=np.float64) - center_m) @ np.asarray(world_rotation).T
     depth = np.where(rays[:, 2] > 1e-9, rays[:, 2], np.nan)
     return _pixels(parameters(camera), rays[:, :2] / depth[:, None]), rays[:, 2]

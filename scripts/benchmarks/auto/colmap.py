@@ -21,12 +21,12 @@ def matched_by_colmap(images: Path, database: Path, *, keypoints: int, max_size_
 
 
 def in_process(step: Callable[..., float], *given: Any) -> float:
-    """SystemExit where the process dies."""
+    """What a step returns that runs in a fresh process; SystemExit where that dies."""
     with fresh_process() as process:
         try:
             return process.submit(step, *given).result()
         except BrokenProcessPool as error:
-            raise SystemExit(f"pycolmap: the process of {step.__name__.strip('_')} died ({error})") from error
+            raise SystemExit(f"the process of {step.__module__}.{step.__name__.strip('_')} died ({error})") from error
 
 
 def _extract(images: Path, database: Path, keypoints: int, max_size_px: int, jobs: int) -> float:

@@ -37,7 +37,7 @@ from benchmarks import options, stamps
 from benchmarks.auto import real, rendered, strategies
 from benchmarks.auto.blocks import PLACES
 from benchmarks.auto.runs import JUDGED
-from benchmarks.peers.table import PEERS, check_method, split_methods
+from benchmarks.peers.table import PEERS, check_method, missing_weights, split_methods
 from benchmarks.processes import limit_threads
 from benchmarks.tables import Row, write_rows
 
@@ -101,7 +101,12 @@ def _real(arguments: Sequence[str]) -> None:
     add("--keypoints", type=options.positive, default=4000, help="SIFT descriptors per image")
     add("--max-size", type=options.positive, default=1600, help="longer side of images, px")
     add("--jobs", type=options.positive, default=2, help="processes at a time")
-    add("--reference-weights", type=Path, metavar="DIR", help="weights of ALIKED and its LightGlue; else without them")
+    add(
+        "--reference-weights",
+        type=Path,
+        metavar="DIR",
+        help="folder of aliked-n16.pth and its LightGlue; else without that chain",
+    )
     options.add_output(parser)
     quick = {"blocks": "seneca", "thin": "5", "presets": "baseline", "keypoints": 1000, "max_size": 800}
     args = options.parse(parser, arguments, quick)
@@ -109,6 +114,12 @@ def _real(arguments: Sequence[str]) -> None:
         parser.error(f"--given: {', '.join(unknown)} are none of {', '.join(real.GIVEN)}")
     for method in args.presets:
         check_method(method, ())
+    if unknown := [name for name in args.blocks if not (args.data / name / "images").is_dir()]:
+        parser.error(f"--blocks: {', '.join(unknown)} not found in {args.data}, each with a folder images")
+    if args.reference_weights is not None and not args.reference_weights.is_dir():
+        parser.error(f"--reference-weights: {args.reference_weights} is no folder")
+    if lacking := missing_weights(real.CHAIN, args.reference_weights):
+        print(f"left out: {real.CHAIN}, for want of {', '.join(lacking)} (--reference-weights DIR)", file=sys.stderr)
     limit_threads(2)
     rows = []
     for row in real.rows_of(args):

@@ -26,13 +26,14 @@ from benchmarks.auto.lightglue import CHAIN, matched_by_lightglue
 from benchmarks.orientation.cases import worsened
 from benchmarks.orientation.figures import attitudes_of, most_alike
 from benchmarks.peers.table import missing_weights
-from benchmarks.sources import OUR_CODE, PEER_CODE, code_digest
+from benchmarks.sources import OUR_CODE, PEER_CODE, code_digest, library_versions
 from benchmarks.tables import Row, interval, markdown, number, plain, ranged, ratio, ratio_of_sums
 from benchmarks.whole import budget_settings, chosen_images, whole_run
 
 # What is given -> case of the benchmark of orientation.
 GIVEN = {"positions": "noise", "nothing": "nothing"}
-_OWN_CODE = ("benchmarks/auto/real.py", "benchmarks/auto/lightglue.py", "benchmarks/auto/colmap.py")
+_OWN_CODE = ("benchmarks/auto/real.py", "evaluate/mapping.py")
+_CHAINS = ("benchmarks/auto/lightglue.py", "benchmarks/auto/colmap.py", "benchmarks/peers/table.py")
 COLMAP = "pycolmap"
 MAPPERS: tuple[Mapper, ...] = ("incremental", "global")
 # Of attitudes after one common turn.
@@ -55,7 +56,7 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
         peers = {}
         for name in asked_peers(args.reference_weights):
             make = partial(_by_peer, args, name, images, reference, folder)
-            peers[name] = _kept(args, folder / f"{name}.json", PEER_CODE, make)
+            peers[name] = _kept(args, folder / f"{name}.json", (*PEER_CODE, *_CHAINS), make)
         for given, preset in product(args.given, args.presets):
             own = _kept(
                 args, folder / f"{preset}-{given}.json", OUR_CODE,
@@ -69,6 +70,7 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
 def _kept(args: argparse.Namespace, path: Path, code: Sequence[str], make: Any) -> Row:
     """What a file has of the same options and code, else what `make` returns."""
     asked = {"keypoints": args.keypoints, "max_size": args.max_size, "code": code_digest(*code, *_OWN_CODE)}
+    asked |= {"libraries": library_versions()}
     known = read_json(path) if path.is_file() else {}
     if known.get("asked") != asked:
         known = {"asked": asked, "row": make()}
@@ -122,7 +124,7 @@ def largest_group(workspace: Workspace) -> tuple[list[str], Row]:
 
 
 def asked_peers(weights: Path | None) -> list[str]:
-    """Chains beside which presets stand: the published one where its weights are there."""
+    """Chains beside which presets stand: the published one where its weights are found."""
     return [COLMAP] if missing_weights(CHAIN, weights) else [COLMAP, CHAIN]
 
 
