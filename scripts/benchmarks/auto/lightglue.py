@@ -43,11 +43,12 @@ def _match(images: Path, database: Path, keypoints: int, max_size_px: int, jobs:
         ids = {name: opened.read_image_with_name(name).image_id for name in names}
         for name, one in features.items():
             opened.write_keypoints(ids[name], corner_places(one.places_px, scales[name]).astype(np.float32))
-        listed = Path(scratch) / "pairs.txt"
-        for first, second in combinations(names, 2):
+        pairs = list(combinations(names, 2))
+        for first, second in pairs:
             rows, _ = chain.rows(features[first], features[second])
             opened.write_matches(ids[first], ids[second], rows.astype(np.uint32))
-        listed.write_text("".join(f"{a} {b}\n" for a, b in combinations(names, 2)), encoding="utf-8")
+        listed = Path(scratch) / "pairs.txt"
+        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
         pycolmap.verify_matches(database, listed, colmap_options(keypoints, jobs)[2])
         return time.perf_counter() - started
 
