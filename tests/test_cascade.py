@@ -90,8 +90,12 @@ def test_learned_keypoints_halve_views_unless_the_user_never_does(words: tuple[s
     assert extract.pixels_per_keypoint == pixels
 
 
-def test_a_step_finds_as_many_keypoints_as_the_first_or_4000_at_most() -> None:
-    for words, guided, learned in (((), 8000, 4000), (("extract.keypoints=900",), 900, 900)):
+def test_a_step_finds_as_many_keypoints_as_the_first() -> None:
+    for words, guided, learned in (
+        ((), 8000, 8000),
+        (("extract=grid",), 4000, 4000),
+        (("extract.keypoints=900",), 900, 900),
+    ):
         settings = load("auto", words)
         assert keypoints_of(GuidedSearch(), settings) == guided
         assert keypoints_of(LearnedFeatures(), settings) == learned

@@ -56,16 +56,15 @@ _SHOWN = 1024
 _TRIED_PARTNERS = 3
 # Matches of two steps that are nearer than this in both images are one.
 SAME_MATCH_PX = 1.0
-# Largest number of descriptors of features that are slow to make, unless a step's settings say another.
-_SLOW_KEYPOINTS = 4000
+# Largest number of descriptors of a step's own features beside a first step whose number is its own, as of a grid.
+_KEYPOINTS = 4000
 
 Key = tuple[str, str]
 
 
 def keypoints_of(step: Any, settings: Settings) -> int:
     """Return the largest number of keypoints that a step finds in an image."""
-    own = getattr(settings.extract, "keypoints", _SLOW_KEYPOINTS)
-    return int((step.keypoints or min(_SLOW_KEYPOINTS, own)) if step.own_features else own)
+    return int(getattr(step, "keypoints", None) or getattr(settings.extract, "keypoints", _KEYPOINTS))
 
 
 def _reduction(settings: Settings) -> dict[str, float]:

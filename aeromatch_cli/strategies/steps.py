@@ -18,8 +18,8 @@ from aeromatch_cli.strategies import Strategy
 _KEYPOINTS: int | None = Field(
     None,
     ge=1,
-    description="Largest number of descriptors per image of this step; null: as many as extract.keypoints, but 4000 at "
-    "most. Larger: more matches, more time and memory.",
+    description="Largest number of descriptors per image of this step; null: as many as extract.keypoints, or 4000 "
+    "where the first step has points of its own number. Larger: more matches, more time and memory.",
 )
 
 
@@ -83,7 +83,7 @@ class LearnedFeatures(Step):
     Views are halved as by `extract=learned` itself, but never where `extract.pixels_per_keypoint` is 0.
     """
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     cheap_to_match: ClassVar[bool] = True
     expectation_weights: ClassVar[tuple[float, ...] | None] = (0.989, 0.852, -0.348, -0.018, 0.449)
     name: Literal["learned"] = "learned"

@@ -75,11 +75,9 @@ def chosen_images(source: Path, every: int, folder: Path) -> Path:
 
 
 def budget_settings(settings: Settings, keypoints: int) -> list[str]:
-    """Settings of a preset for so many SIFT descriptors per image; networks, which take longer for each, have half as
-    many, as by default. A grid has points of its own number."""
-    most = keypoints if settings.extract.name == "sift" else keypoints // 2
-    asked = [f"extract.keypoints={most}"] if hasattr(settings.extract, "keypoints") else []
-    return asked + [f"cascade.{s.name}.keypoints={keypoints // 2}" for s in settings.cascade if s.own_features]
+    """Settings of a preset for so many descriptors per image in every step with features of its own. A grid has points
+    of its own number."""
+    return [f"extract.keypoints={keypoints}"] if hasattr(settings.extract, "keypoints") else []
 
 
 def judged_run(

@@ -20,8 +20,8 @@
 
 Correct: within 3 px of the exact place in both directions. Correctness: share of the kept matches that is correct, in
 the block where it is least, too. Auto / it: correct matches on the same pairs. Seconds: of whole runs without report on
-one core, of peers of features, matching and verification. Methods with SIFT have --keypoints descriptors an image,
-those with networks half as many; a cascade has both. In brackets: 90 % intervals by bootstrap, over pairs in rendered
+one core, of peers of features, matching and verification. Every method has --keypoints descriptors an image, `auto` in
+both of its steps with features. In brackets: 90 % intervals by bootstrap, over pairs in rendered
 blocks, over thinned blocks in real ones. What OUT has of the same code and options is not made again.
 """
 
@@ -56,8 +56,7 @@ def _rendered(section: str, arguments: Sequence[str]) -> None:
     add("--seeds", type=options.numbers, default="1,2", help="of the blocks, comma-separated")
     add("--size", metavar="WxH", default="640x480", help="of rendered images")
     add("--images", type=options.positive, default=5, help="of each rendered block, twice as many of five cameras")
-    about = "SIFT descriptors per image; networks have half as many"
-    add("--keypoints", type=options.positive, default=4096, help=about)
+    add("--keypoints", type=options.positive, default=4096, help="descriptors per image, of every step")
     if section == "rendered":
         add("--methods", type=split_methods, default=METHODS, help=f"presets, and of {', '.join(PEERS)}")
     else:
@@ -98,7 +97,7 @@ def _real(arguments: Sequence[str]) -> None:
     add("--thin", type=options.numbers, default="4", help="keep every k-th image; several k comma-separated")
     add("--given", type=options.names, default="positions,nothing", help=f"of {', '.join(real.GIVEN)}")
     add("--presets", type=split_methods, default=JUDGED, help="comma-separated")
-    add("--keypoints", type=options.positive, default=4000, help="SIFT descriptors per image")
+    add("--keypoints", type=options.positive, default=4000, help="descriptors per image, of every step")
     add("--max-size", type=options.positive, default=1600, help="longer side of images, px")
     add("--jobs", type=options.positive, default=2, help="processes at a time")
     add(

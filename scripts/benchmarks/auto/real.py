@@ -135,8 +135,8 @@ def _by_peer(args: argparse.Namespace, name: str, images: Path, reference: Path,
     if name == COLMAP:
         seconds = matched_by_colmap(images, database, keypoints=args.keypoints, **most)
     else:
-        total, weights = args.keypoints + args.keypoints // 2, args.reference_weights
-        seconds = matched_by_lightglue(images, database, keypoints=total, weights=weights, **most)
+        weights = args.reference_weights
+        seconds = matched_by_lightglue(images, database, keypoints=2 * args.keypoints, weights=weights, **most)
     row: Row = {}
     for mapper in MAPPERS:
         found = map_database(database, images, mapper, attitudes=True)

@@ -13,7 +13,7 @@ from aeromatch_cli.config import parse_method
 from aeromatch_cli.files import read_json, write_json
 from benchmarks.auto.blocks import Block
 from benchmarks.peers.base import Options
-from benchmarks.peers.table import NEED_WEIGHTS, PEERS, reads_poses
+from benchmarks.peers.table import PEERS, reads_poses
 from benchmarks.peers.worker import measure
 from benchmarks.scenes import NOISY_POSES, Judged, with_noisy_poses
 from benchmarks.sources import OUR_CODE, code_digest
@@ -65,8 +65,7 @@ def _preset_rows(args: argparse.Namespace, block: Block, judged: Judged, method:
 
 def _peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
     """Every judged pair in turn; features of an image count once."""
-    most = args.keypoints // 2 if peer in NEED_WEIGHTS else args.keypoints
-    limits = Options(most, "image", 1, 0, args.reference_weights)
+    limits = Options(args.keypoints, "image", 1, 0, args.reference_weights)
     noisy = with_noisy_poses(judged) if reads_poses(peer) else None
     rows: list[Row] = []
     known: set[str] = set()

@@ -18,7 +18,7 @@ six nearest points of the reference (2 px, seen from either image). First / it: 
 --methods over those of this one, on the same pairs. Error: median of the pairs' medians. Seconds: median of pairs,
 features of both images included, decoding too, and those of matching and verification alone; start-up is not timed. A
 preset with further steps (`auto`), which decides by the whole block, is run on that once, as the command does it with
-the same poses: its learned features have half the descriptors beside those of SIFT, and its seconds are the run's,
+the same poses: its learned features have as many descriptors as SIFT beside them, and its seconds are the run's,
 divided by all pairs, which share features. `:total` gives a peer as many as both together. Every preset has --keypoints
 descriptors, whatever its brackets say of extract.keypoints. In brackets: 90 % intervals by bootstrap over pairs. OUT
 keeps what every method answered: what depends on nothing that changed is not made again.

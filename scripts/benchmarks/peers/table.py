@@ -50,7 +50,7 @@ ON_GROUND, TOTAL = "@ground", ":total"
 
 def _at_total(scene: Scene, options: Options, *, peer: Make) -> Method:
     """With as many descriptors as the features of `auto` have together."""
-    return peer(scene, replace(options, keypoints=options.keypoints + options.keypoints // 2))
+    return peer(scene, replace(options, keypoints=2 * options.keypoints))
 
 
 _ALSO_AT_TOTAL = ("aliked+lightglue", "aliked+lightglue@ground")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from benchmarks.peers.base import Described, Found, Method, Options, Scene
 
 
 class Union:
-    """The first peer has the budget, the second half of it, as the steps of `auto` have."""
+    """Each has the budget, as the steps of `auto` have."""
 
     def __init__(
         self,
@@ -21,8 +20,7 @@ class Union:
         first: Callable[[Scene, Options], Method],
         second: Callable[[Scene, Options], Method],
     ) -> None:
-        half = replace(options, keypoints=options.keypoints // 2)
-        self.peers = first(scene, options), second(scene, half)
+        self.peers = first(scene, options), second(scene, options)
 
     def features(self, image: str) -> tuple[Described, ...]:
         return tuple(peer.features(image) for peer in self.peers)
