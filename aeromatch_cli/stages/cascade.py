@@ -56,15 +56,14 @@ _SHOWN = 1024
 _TRIED_PARTNERS = 3
 # Matches of two steps that are nearer than this in both images are one.
 SAME_MATCH_PX = 1.0
-# Largest number of descriptors of a step's own features beside a first step whose number is its own, as of a grid.
-_KEYPOINTS = 4000
 
 Key = tuple[str, str]
 
 
 def keypoints_of(step: Any, settings: Settings) -> int:
     """Return the largest number of keypoints that a step finds in an image."""
-    return int(getattr(step, "keypoints", None) or getattr(settings.extract, "keypoints", _KEYPOINTS))
+    first: Any = settings.extract  # never a grid, which has no keypoints that a cascade could join
+    return int((step.keypoints or first.keypoints) if step.own_features else first.keypoints)
 
 
 def _reduction(settings: Settings) -> dict[str, float]:

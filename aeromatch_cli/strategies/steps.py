@@ -18,8 +18,8 @@ from aeromatch_cli.strategies import Strategy
 _KEYPOINTS: int | None = Field(
     None,
     ge=1,
-    description="Largest number of descriptors per image of this step; null: as many as extract.keypoints, or 4000 "
-    "where the first step has points of its own number. Larger: more matches, more time and memory.",
+    description="Largest number of descriptors per image of this step; null: as many as extract.keypoints. "
+    "Larger: more matches, more time and memory.",
 )
 
 
