@@ -38,11 +38,10 @@ COLMAP = "pycolmap"
 MAPPERS: tuple[Mapper, ...] = ("incremental", "global")
 # Of attitudes after one common turn.
 CORRECT_DEG = 3.0
+_FIGURES = ("registered", "attitudes correct", "points", "error px", "s")
 HEADS = (
-    "block", "given", "preset", "images", "in our model", "attitudes correct", "from our export",
-    "by pycolmap alone", "attitudes correct",
-    "points", "its points", "error px", "its error px", "s", "its s",
-    f"by {CHAIN}", "attitudes correct", "its points", "its error px", "its s",
+    "block", "given", "preset", "images", *_FIGURES, "from its export",
+    *(f"{chain}: {figure}" for chain in (COLMAP, CHAIN) for figure in _FIGURES),
 )  # fmt: skip
 
 
@@ -69,7 +68,8 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
 
 def _kept(args: argparse.Namespace, path: Path, code: Sequence[str], make: Any) -> Row:
     """What a file has of the same options and code, else what `make` returns."""
-    asked = {"keypoints": args.keypoints, "max_size": args.max_size, "code": code_digest(*code, *_OWN_CODE)}
+    asked = {"keypoints": args.keypoints, "max_size": args.max_size, "jobs": args.jobs}
+    asked |= {"code": code_digest(*code, *_OWN_CODE)}
     asked |= {"libraries": library_versions()}
     known = read_json(path) if path.is_file() else {}
     if known.get("asked") != asked:
@@ -162,20 +162,16 @@ def table_of(rows: Sequence[Row]) -> str:
     lines: list[list[object]] = []
     most: dict[str, list[tuple[float, float]]] = {}
     for row in rows:
-        peer, best = row[COLMAP], best_mapper(row[COLMAP])
+        best = best_mapper(row[COLMAP])
         export = " / ".join(str(row.get(f"by_{mapper}", 0)) for mapper in MAPPERS)
-        errors = [number(one.get("reprojection_error_px") or np.nan, 2) for one in (row, best)]
-        lines.append(
-            [_thinned(row), row["given"], f"`{row['preset']}`", row["images"], row["registered"], row["correct"],
-             export, _registered(peer), best["correct"], row.get("points") or 0, best.get("points", 0), *errors,
-             number(row["seconds"]), number(best["seconds"]), *_published(row)]
-        )  # fmt: skip
+        head = [_thinned(row), row["given"], f"`{row['preset']}`", row["images"], row["registered"]]
+        lines.append([*head, *_figures(row), export, *_of_chain(row, COLMAP), *_of_chain(row, CHAIN)])
         others = [best.get("registered", 0)] + [row.get(f"by_{m}", 0) for m in MAPPERS]
         most.setdefault(_thinned(row), []).append((row["registered"], max(others)))
     fewer = sum(own < other for cases in most.values() for own, other in cases)
     parts = [
-        f"{_points_beside(rows, COLMAP)}. Images in our model over the most that any mapper registers from our export "
-        f"or pycolmap's chain: {_beside(most)}; fewer in {fewer} of {len(rows)} cases.",
+        f"{_points_beside(rows, COLMAP)}. Images in the preset's model over the most that any mapper registers from "
+        f"its export or from pycolmap's chain: {_beside(most)}; fewer in {fewer} of {len(rows)} cases.",
         *([_beside_published(rows)] if any(CHAIN in row for row in rows) else []),
         markdown(HEADS, lines),
     ]
@@ -186,17 +182,18 @@ def _thinned(row: Row) -> str:
     return str(row["block"]) if row["every"] == 1 else f"{row['block']} / {row['every']}"
 
 
-def _registered(peer: Row) -> str:
-    return " / ".join(str(peer[mapper].get("registered", 0)) for mapper in MAPPERS)
+def _figures(row: Row) -> list[object]:
+    """All columns of a model after its registered images."""
+    error = number(row.get("reprojection_error_px") or np.nan, 2)
+    return [row["correct"], row.get("points") or 0, error, number(row["seconds"])]
 
 
-def _published(row: Row) -> list[object]:
-    """Columns of the published chain, empty where it was not run."""
-    if CHAIN not in row:
-        return [""] * 5
-    best = best_mapper(row[CHAIN])
-    error = number(best.get("reprojection_error_px") or np.nan, 2)
-    return [_registered(row[CHAIN]), best["correct"], best.get("points", 0), error, number(best["seconds"])]
+def _of_chain(row: Row, chain: str) -> list[object]:
+    """Columns of another chain, empty where it was not run."""
+    if chain not in row:
+        return [""] * len(_FIGURES)
+    registered = " / ".join(str(row[chain][mapper].get("registered", 0)) for mapper in MAPPERS)
+    return [registered, *_figures(best_mapper(row[chain]))]
 
 
 def _points_beside(rows: Sequence[Row], peer: str) -> str:
