@@ -80,6 +80,14 @@ def test_the_rule_for_strategies(correct: int, kept: int, expected: str) -> None
     assert strategies.verdict(ours, [{"correct": correct, "kept": kept, "wrong": kept - correct}]) == expected
 
 
+def test_a_gain_within_its_interval_is_none() -> None:
+    """Two wrong matches less in 4 of 20 pairs, and two more in one."""
+    ours = [{"correct": 100, "kept": 102, "wrong": 2}] * 4 + [{"correct": 100, "kept": 100, "wrong": 0}] * 16
+    arm = [{"correct": 100, "kept": 100, "wrong": 0}] * 19 + [{"correct": 100, "kept": 102, "wrong": 2}]
+    assert strategies.verdict(ours, arm) == strategies.NOT_ACCEPTED
+    assert strategies.verdict(ours, [{"correct": 100, "kept": 100, "wrong": 0}] * 20) == strategies.ACCEPTED
+
+
 def test_strategies_have_a_verdict_by_condition() -> None:
     found = [*rows("auto", "suburb:nadir", [90, 60], [100, 70]), *rows("auto", "city:mixed", [40, 50], [50, 50])]
     better, worse = [90, 60], [95, 65]

@@ -7,7 +7,8 @@
               tries them or not, and no others. `polar` is asked where all pictures look straight down
   strategies  `auto` with other settings (--strategies, each KEY=VALUE or auto[KEY=VALUE,...]) on the same blocks,
               beside `auto`: accepted where it brings 2 % more correct matches at no lower correctness (to 0.1 percent
-              points), or a fifth fewer wrong ones for at most 1 % fewer correct ones
+              points), or a fifth fewer wrong ones for at most 1 % fewer correct ones; the interval of that ratio must
+              not hold 1
   real        every k-th image of real blocks (DATA/BLOCK/images, DATA/BLOCK/reference/{poses.csv,block.json}), with
               positions that are off by 5 m or nothing, cameras from EXIF: images in the largest group of the exported
               block, beside what both of pycolmap's mappers (incremental / global) register from the same run's export

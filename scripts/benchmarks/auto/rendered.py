@@ -62,9 +62,13 @@ def of_condition(rows: Sequence[Row], condition: str) -> list[Row]:
 
 def correct_beside(ours: Sequence[Row], theirs: Sequence[Row], field: str = "correct") -> str:
     """Sum of ours over sum of theirs, with its interval over pairs. Rows of the same pairs, in the same order."""
+    return ranged(*ratio_beside(ours, theirs, field), 2)
+
+
+def ratio_beside(ours: Sequence[Row], theirs: Sequence[Row], field: str) -> tuple[float, tuple[float, float]]:
+    """The same as numbers."""
     pairs = [(a[field] or 0.0, b[field] or 0.0) for a, b in zip(ours, theirs, strict=True)]
-    sums = np.sum(pairs, axis=0)
-    return ranged(ratio(*sums), interval(pairs, ratio_of_sums), 2)
+    return ratio(*np.sum(pairs, axis=0)), interval(pairs, ratio_of_sums)
 
 
 def table_of(rows: Sequence[Row]) -> str:

@@ -1,7 +1,7 @@
 """auto with one strategy more, or another one, beside auto as it is, on the same blocks: whether it belongs into it.
 
 A strategy is accepted where it brings 2 % more correct matches at no lower correctness, or a fifth fewer wrong ones for
-1 % fewer correct ones at most.
+1 % fewer correct ones at most, and where the interval of that ratio does not hold 1.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from benchmarks.auto.blocks import ALL, CONDITIONS
-from benchmarks.auto.rendered import by_block, correct_beside, correctness, of_condition
+from benchmarks.auto.rendered import by_block, correct_beside, correctness, of_condition, ratio_beside
 from benchmarks.auto.runs import JUDGED
-from benchmarks.tables import Row, code, grouped, markdown, percent, ratio, total
+from benchmarks.tables import Row, code, grouped, markdown, percent
 
 MORE_CORRECT, FEWER_WRONG, MOST_LOST = 1.02, 0.80, 0.99
 # Of correctness: what counts as equal.
@@ -21,11 +21,12 @@ HEADS = ("strategy", "condition", "blocks", "correct / auto's", "wrong / auto's"
 
 
 def verdict(ours: Sequence[Row], arm: Sequence[Row]) -> str:
-    """The rule on the sums over the same pairs."""
-    more = ratio(total(arm, "correct"), total(ours, "correct"))
-    wrong = ratio(total(arm, "wrong"), total(ours, "wrong"))
+    """The rule on the sums over the same pairs, in the same order; one pair has no interval."""
+    more, (least, _) = ratio_beside(arm, ours, "correct")
+    wrong, (_, most) = ratio_beside(arm, ours, "wrong")
     equal = correctness(arm) >= correctness(ours) - _EQUAL
-    better = (more >= MORE_CORRECT and equal) or (wrong <= FEWER_WRONG and more >= MOST_LOST)
+    brings = more >= MORE_CORRECT and equal and not least <= 1.0
+    better = brings or (wrong <= FEWER_WRONG and more >= MOST_LOST and not most >= 1.0)
     return ACCEPTED if better else NOT_ACCEPTED
 
 
