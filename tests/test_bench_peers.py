@@ -387,13 +387,13 @@ def test_two_peers_together_have_the_matches_of_both(site: Site) -> None:
     options = base.Options(150, "image", 1, 0, None)
     both = Union(scene, options, first=table.PEERS["opencv-sift"], second=table.PEERS["opencv-sift@ground"])
     sides = [both.features(name) for name in names]
-    assert [[len(one.places_px) for one in side] for side in sides] == [[150, 75], [150, 75]]
+    assert [[len(one.places_px) for one in side] for side in sides] == [[150, 150], [150, 150]]
     found = both.match(*names, *sides)
     alone = [peer.match(*names, *own) for peer, *own in zip(both.peers, *sides, strict=True)]
     assert len(alone[0].points0_px) > 0
     assert len(alone[1].points0_px) > 0
     assert (found.points1_px == np.concatenate([one.points1_px for one in alone])).all()
-    assert found.descriptors == 225
+    assert found.descriptors == 300
 
 
 def test_a_preset_with_further_steps_is_run_on_the_whole_block_once(
